@@ -1,0 +1,334 @@
+"""The command line: `python -m dnddpg_minimal train | watch | study | benchmark`.
+
+`train` and `watch` are below; every other command is the `main(argv)` of the module of
+its name, imported only when asked for. A user's mistake gets one line on the error
+stream and exit code 2, never a traceback.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import math
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from dnddpg_minimal.dnddpg import Config, NumpyAgent, Training, make_env, to_env
+
+SAVE_EVERY = 120  # seconds between two checkpoints
+FILM_LENGTH = 200  # pictures at most
+FILM_WIDTH = 300  # pixels at most
+FILM_COLOURS = 32
+SHORTEST_PICTURE = 20  # milliseconds; viewers slow down a film that is faster
+INTERRUPTED = 130  # exit code of a program that Ctrl-C ended
+
+
+# --- train ----------------------------------------------------------------------------
+
+
+def train(
+    config: Annotated[Config, tyro.conf.arg(name="")],
+    out: Path | None = None,
+    resume: Path | None = None,
+) -> int:
+    """Train one agent and save the run.
+
+    A default of None means: from the task's preset, or no limit. Ctrl-C finishes the
+    episode, saves, and says how to go on; a second Ctrl-C leaves at once.
+
+    Args:
+        config: every choice of the run.
+        out: file to write (.npz); None: TASK-ALGORITHM-SEED.npz in the current folder.
+        resume: go on with the run in this file, as if it had never stopped.
+    """
+    if out is None:
+        name = f"{config.task}-{config.algorithm}-{config.seed}.npz".replace("/", "-")
+        out = resume or Path(name)
+    if out != resume and out.exists():
+        raise ValueError(f"{out} exists. Name another file by --out, or go on with "
+                         f"it: {command('train --resume', out)}")
+    check_can_write(out)
+    if resume is None:
+        return run(Training(config), out)
+    training = Training.load(resume)
+    if config not in (Config(), training.config):
+        raise ValueError(f"--resume goes on with the run in {resume} as it was "
+                         "configured: leave the other options out.")
+    return run(training, out)
+
+
+def run(training, out):
+    """Train to the end, or to Ctrl-C. Saves to `out`, says how to go on → exit code."""
+    go_on = command("train --resume", out)
+    saved_at = time.monotonic()
+    scale = dict(total=training.config.steps, initial=training.step, unit=" steps")
+    with Interrupt() as interrupt, tqdm(**scale) as bar:
+        try:
+            for record in training:
+                bar.update(record.step - bar.n)
+                if interrupt.asked:
+                    bar.set_description_str("Ctrl-C: finishing the episode")
+                if record.kind != "episode":
+                    continue
+                bar.set_postfix_str(f"return {record.episode_return:.1f}", False)
+                if interrupt.asked:
+                    break
+                if time.monotonic() - saved_at > SAVE_EVERY:
+                    training.save(out)
+                    saved_at = time.monotonic()
+            training.save(out)
+        except KeyboardInterrupt:
+            bar.close()
+            print(f"Left at once. Go on from the last checkpoint: {go_on}"
+                  if out.exists() else "Left at once, before the first checkpoint.")
+            return INTERRUPTED
+    if not training.finished:
+        print(f"Stopped and saved at step {training.step}. Go on: {go_on}")
+        return INTERRUPTED
+    returns = [r.episode_return for r in training.records if r.kind == "episode"][-10:]
+    print(f"Done: {training.step} steps, {training.episode} episodes, saved in {out}")
+    if returns:
+        print(f"Mean return of the last {len(returns)} episodes, exploration noise "
+              f"included: {np.mean(returns):.1f}")
+    print(f"See it: {command('watch', out)}")
+    return 0
+
+
+class Interrupt:
+    """Inside `with`, the first Ctrl-C only sets `asked`; the second one interrupts."""
+
+    def __enter__(self):
+        self.asked = False
+        self.before = signal.signal(signal.SIGINT, self.ask)
+        return self
+
+    def __exit__(self, *_):
+        signal.signal(signal.SIGINT, self.before)
+
+    def ask(self, *_):
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+
+
+# --- watch ----------------------------------------------------------------------------
+
+
+def watch(
+    file: Annotated[Path, tyro.conf.Positional],
+    film: Path | None = None,
+    episodes: int = 1,
+    seed: int = 0,
+) -> int:
+    """Show a saved agent at work, in a window or as a film, and print its return.
+
+    The agent acts without exploration noise.
+
+    Args:
+        file: what `train` saved, or an agent's own file.
+        film: write a film to this file (.gif) instead of opening a window.
+        episodes: how many to show.
+        seed: of the first episode's start; the next episode has the next number.
+    """
+    agent = NumpyAgent.load(file)  # also opens a PyTorch agent, and needs no PyTorch
+    if film is None:
+        check_display()
+        env = make_env(agent.config, render_mode="human")
+    else:
+        check_can_write(film, suffix=".gif")
+        env = make_camera_env(agent.config)
+    starts, steps = range(seed, seed + episodes), 0
+    for start in starts:
+        rewards = list(play(agent, env, start))
+        steps += len(rewards)
+        print(f"Seed {start}: return {sum(rewards):.1f} in {len(rewards)} steps")
+    if film is not None:
+        every = math.ceil(steps / FILM_LENGTH)  # a picture every so many steps
+        pictures = [env.render() for start in starts
+                    for step, _ in enumerate(play(agent, env, start))
+                    if step % every == 0]
+        seconds = every / env.metadata.get("render_fps", 30)
+        write_film(film, pictures, seconds)
+        print(f"The film: {film}")
+    env.close()
+    return 0
+
+
+def play(agent, env, seed):
+    """One episode of the greedy policy from one start; yields each step's reward."""
+    obs, _ = env.reset(seed=seed)
+    over = False
+    while not over:
+        action = to_env(agent.act(obs), env.action_space)
+        obs, reward, terminated, truncated, _ = env.step(action)
+        over = terminated or truncated
+        yield float(reward)
+
+
+def write_film(path, pictures, seconds):
+    """Write a GIF of the pictures, each (height, width, 3) uint8, with one palette.
+
+    seconds: how long each picture stays.
+    """
+    from PIL import Image
+
+    small = [Image.fromarray(picture) for picture in pictures]
+    for image in small:
+        image.thumbnail((FILM_WIDTH, FILM_WIDTH))
+    samples = small[:: math.ceil(len(small) / 10)]
+    width, height = small[0].size
+    strip = Image.new("RGB", (width, height * len(samples)))
+    for row, image in enumerate(samples):
+        strip.paste(image, (0, row * height))
+    palette = strip.quantize(FILM_COLOURS)
+    none = Image.Dither.NONE  # dithering flickers, and does not compress
+    first, *rest = [image.quantize(palette=palette, dither=none) for image in small]
+    milliseconds = max(SHORTEST_PICTURE, round(1000 * seconds))
+    first.save(path, save_all=True, append_images=rest, duration=milliseconds, loop=0)
+
+
+def make_camera_env(config):
+    """An environment that draws without a window. ValueError if that can't be done."""
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # before pygame is imported
+    if not has_display():
+        os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported
+    try:
+        env = make_env(config, render_mode="rgb_array")
+        if hasattr(env.unwrapped, "model"):  # MuJoCo on a CPU: 4 times as fast without
+            quality = env.unwrapped.model.vis.quality  # fine shadows and fine edges,
+            quality.shadowsize, quality.offsamples = 512, 0  # and shrinking smooths too
+        env.reset(seed=0)
+        if env.render() is None:
+            raise ValueError(f"task={config.task!r} draws no pictures")
+    except ValueError:
+        raise
+    except Exception as error:  # each library has its own for "no graphics here"
+        sys.unraisablehook = lambda _: None  # half-made viewers fail again when deleted
+        raise ValueError(
+            f"no picture of {config.task!r} can be made here ({error}). Without a "
+            "display MuJoCo needs EGL (Debian: libegl1, libgl1-mesa-dri).") from error
+    return env
+
+
+def has_display():
+    """False on a Linux that has no screen to open a window on."""
+    return sys.platform != "linux" or bool(
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def check_display():
+    if not has_display():
+        raise ValueError("there is no display to open a window on: "
+                         "write a film instead, with --film FILE.gif")
+
+
+# --- the commands ---------------------------------------------------------------------
+
+ELSEWHERE = {
+    "study": "Run, resume and list the recorded study.",
+    "benchmark": "Measure the speed, side by side with a peer.",
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command. argv: the words after `python -m dnddpg_minimal` → exit code."""
+    argv = sys.argv[1:] if argv is None else list(argv)
+    try:
+        if argv and argv[0] in elsewhere():
+            module = importlib.import_module(f"dnddpg_minimal.{argv[0]}")
+            return module.main(argv[1:])
+        app = tyro.extras.SubcommandApp()
+        app.command(train)
+        app.command(watch)
+        for name, text in elsewhere().items():
+            app.command(lambda: 0, name=name, help=text)
+        return app.cli(
+            args=argv,
+            prog="python -m dnddpg_minimal",
+            description="DDPG, a second critic, a second actor, and how wrong Q is.",
+            config=(tyro.conf.DisallowNone,),
+            registry=task_options_registry(),
+        )
+    except (ValueError, OSError, ImportError) as error:
+        print(f"dnddpg_minimal: {in_words(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+def elsewhere():
+    """The commands whose module exists, and what they do."""
+    return {name: text for name, text in ELSEWHERE.items()
+            if importlib.util.find_spec(f"dnddpg_minimal.{name}")}
+
+
+def task_options_registry():
+    """Teach tyro `--task-options NAME=VALUE ...`."""
+    registry = tyro.constructors.ConstructorRegistry()
+
+    @registry.primitive_rule
+    def rule(info):
+        if info.type != (dict[str, Any] | None):
+            return None
+        return tyro.constructors.PrimitiveConstructorSpec(
+            nargs="*",
+            metavar="NAME=VALUE ...",
+            instance_from_str=task_options,
+            is_instance=lambda value: value is None or isinstance(value, dict),
+            str_from_instance=lambda value: [str(value)],  # for --help: "None"
+        )
+
+    return registry
+
+
+def task_options(words):
+    """["goal_area=window", "success_terminates=true"] → a dict; values as in JSON."""
+    options = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not (name and equals):
+            raise ValueError(f"task_options: expected NAME=VALUE, got {word!r}")
+        try:
+            options[name] = json.loads(value)
+        except json.JSONDecodeError:
+            options[name] = value  # a bare word is text
+    return options
+
+
+def command(words, path):
+    """The command line that runs `words` on a file, as one would type it here."""
+    line = [sys.orig_argv[0], "-m", "dnddpg_minimal", *words.split(), str(path)]
+    return subprocess.list2cmdline(line) if os.name == "nt" else shlex.join(line)
+
+
+def check_can_write(path, suffix=None):
+    """ValueError if the file can't be written: better now than after the run."""
+    folder = path.parent
+    if not folder.is_dir():
+        raise ValueError(f"{path}: there is no folder {folder}")
+    if path.is_dir() or not os.access(folder, os.W_OK):
+        raise ValueError(f"{path} can't be written here")
+    if suffix and path.suffix.lower() != suffix:
+        raise ValueError(f"{path}: expected a name that ends in {suffix}")
+
+
+def in_words(error):
+    """An exception as one line."""
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split())
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,167 @@
+"""The project as a whole: its commands, its pins, its notebooks, its files."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+REQUIREMENTS = [line for line in (ROOT / "requirements.txt").read_text().splitlines()
+                if line and not line.startswith("#")]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+NOTEBOOKS = [path for folder in ("notebooks", "solutions")
+             for path in sorted((ROOT / folder).glob("*.ipynb"))]
+TEXT = {".py", ".md", ".toml", ".txt", ".cff", ".ipynb", ".json", ".yml", ""}
+MACHINE_PATH = re.compile(
+    r"(?<![\w.])(?:/(?:work|tmp|root|home|opt|Users)/|[A-Z]:\\\\?Users)[\w./\\-]*")
+
+
+def project_files():
+    """Every text file of the project, whether git knows it yet or not."""
+    folders = [ROOT / name for name in ("dnddpg_minimal", "tests", "notebooks",
+                                        "solutions", "exercises", ".ci")]
+    found = [path for path in ROOT.iterdir() if path.is_file()]
+    found += [path for folder in folders for path in folder.rglob("*")]
+    return [path for path in found
+            if path.is_file() and path.suffix in TEXT and path.name != ".git"
+            and not {"__pycache__", ".ipynb_checkpoints"} & set(path.parts)]
+
+
+def code_blocks(language):
+    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.M | re.S)
+
+
+# --- two commands ---------------------------------------------------------------------
+
+
+def test_the_readme_gives_two_complete_commands_of_one_line_each():
+    read, check = [block for block in code_blocks("sh") if "-m venv" in block]
+    for command in (read, check):
+        assert command.count("\n") == 1
+        assert command.startswith("python3 -m venv .venv && ")
+        assert "pip install -r requirements.txt" in command
+    assert read.split("&& ")[-1].split()[-1] == "notebooks/00_start_here.ipynb"
+    assert "pytest --nbval" in check
+
+
+def test_windows_has_the_same_two_commands():
+    unix = [block for block in code_blocks("sh") if "-m venv" in block]
+    translated = [command.replace("python3", "py -3").replace(" &&", ";")
+                  .replace(".venv/bin/", ".venv\\Scripts\\") for command in unix]
+    assert code_blocks("powershell") == translated
+
+
+@pytest.mark.skipif(not shutil.which("bash") or os.name == "nt", reason="needs bash")
+def test_ci_runs_the_second_command_of_the_readme():
+    shown = subprocess.run(["bash", ROOT / ".ci" / "run", "--print"], text=True,
+                           capture_output=True, check=True).stdout
+    assert shown in code_blocks("sh")
+    assert shown.rstrip().endswith("-m pytest --nbval")
+
+
+def test_pytest_without_a_path_collects_tests_notebooks_and_solutions():
+    options = PROJECT["tool"]["pytest"]["ini_options"]
+    assert options["testpaths"] == ["tests", "notebooks", "solutions"]
+
+
+def test_the_readme_stays_short_and_names_only_what_exists():
+    assert len(README.splitlines()) < 150
+    linked = re.findall(r"\]\((?!https?:)([^)#]+)\)", README)
+    named = re.findall(r"`((?:dnddpg_minimal|notebooks|tests)/[^`]*)`", README)
+    for name in linked + named:
+        assert (ROOT / name).exists(), name
+
+
+def test_the_readmes_python_runs(tmp_path):
+    (code,) = code_blocks("python")
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, text=True,
+                          capture_output=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "pendulum.npz").exists()
+
+
+# --- installation ---------------------------------------------------------------------
+
+
+def test_requirements_are_exact_pins_and_install_the_package_last():
+    *pins, last = REQUIREMENTS
+    assert last == "-e ."
+    for pin in pins:
+        assert re.fullmatch(r"[a-z0-9-]+(\[[a-z,-]+\])?==\d+(\.\d+)+", pin), pin
+
+
+def test_what_the_package_needs_is_pinned():
+    def name(requirement):
+        return re.match(r"[a-z0-9-]+(\[[a-z,-]+\])?", requirement)[0]
+
+    def extras(requirement):
+        return sorted(re.findall(r"[a-z0-9-]+", name(requirement)))
+
+    needed = [extras(line) for line in PROJECT["project"]["dependencies"]]
+    pinned = [extras(line) for line in REQUIREMENTS[:-1]]
+    assert [names for names in needed if names not in pinned] == []
+
+
+def test_importing_the_package_is_light():
+    heavy = {"torch", "pandas", "matplotlib.pyplot", "mujoco", "pygame", "scipy"}
+    code = f"import sys, dnddpg_minimal; print(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True,
+                          check=True)
+    assert done.stdout.strip() == "[]"
+
+
+# --- files ----------------------------------------------------------------------------
+
+
+def test_ruff_finds_nothing():
+    done = subprocess.run([sys.executable, "-m", "ruff", "check", "--no-cache", ROOT],
+                          capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_lines_end_in_lf_and_files_end_in_a_line():
+    for path in project_files():
+        content = path.read_bytes()
+        assert b"\r\n" not in content, path
+        assert not content or content.endswith(b"\n"), path
+
+
+def test_no_file_or_notebook_names_a_folder_of_somebodys_machine():
+    for path in project_files():
+        text = path.read_text(encoding="utf-8")
+        assert path == Path(__file__) or not MACHINE_PATH.search(text), path
+
+
+# --- notebooks ------------------------------------------------------------------------
+
+
+def code_cells(notebook):
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    return [cell for cell in cells
+            if cell["cell_type"] == "code" and "".join(cell["source"]).strip()]
+
+
+each_notebook = pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda p: p.stem)
+
+
+@each_notebook
+def test_every_code_cell_was_run_in_order(notebook):
+    # nbval passes a notebook that was never run, without a word.
+    counts = [cell["execution_count"] for cell in code_cells(notebook)]
+    assert counts == list(range(1, len(counts) + 1))
+
+
+@each_notebook
+def test_no_stored_output_is_an_error_or_a_warning(notebook):
+    for cell in code_cells(notebook):
+        expected = "nbval-raises-exception" in cell["metadata"].get("tags", [])
+        for output in cell["outputs"]:
+            assert output["output_type"] != "error" or expected, output["ename"]
+            assert output.get("name") != "stderr", output["text"]
