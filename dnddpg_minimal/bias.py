@@ -9,7 +9,8 @@ when a is done first and pi is obeyed from then on, for ever. A real end stops t
 
 where the truth comes from                                               horizon
 ---------------------------------------------------------------------   --------
-Pendulum-v1, the Arms     the task's equations, all states in lock-step  500
+Pendulum-v1, the Arms,    the task's equations, all states in lock-step  500
+the probes
 MountainCarContinuous-v0  the same                                       999
 MuJoCo, on-policy         the rewards that followed in the same episode  500 or more
 MuJoCo, kept states       the simulator, put back and stepped on         500
@@ -19,19 +20,20 @@ The sum stops at the horizon H. What is left out is at most
 gamma^H * max|reward| / (1 - gamma) (`Measurement.tail`): at gamma = 0.99 and H = 500
 that is 0.7 % of the largest value that is possible.
 
-call                                     meaning
---------------------------------------   ----------------------------------------------
-dynamics(config)                         a task's equations for N states, or None
-rollout(world, states, policy, gamma)    truth, return and ends of N states: dict of (N,)
-true_q(world, states, action, agent)     Q^pi(s, a): (N,)
-evaluate(training)                       one `Measurement` at the present step
-plane(agent, world, x, y)                Q and truth over two state variables: a picture
-summary(values)                          mean, standard error, n
-owed(updates, values, config)            the bias that a critic has because it lags
-predict(sigma, kappa, rho, rule)         the bias that one target makes, in closed form
+call                                    meaning
+-------------------------------------   ----------------------------------------------
+dynamics(config)                        a task's equations for N states, or None
+rollout(world, states, policy, gamma)   truth, return, ends of N states: dict of (N,)
+true_q(world, states, action, agent)    Q^pi(s, a): (N,)
+evaluate(training)                      one `Measurement` at the present step
+plane(agent, world, x, y)               Q and truth over two state variables
+summary(values)                         mean, standard error, n
+owed(updates, values, config)           the bias that a critic has because it lags
+predict(sigma, kappa, rho, rule)        the bias that one target makes, closed form
 
 Shapes: C critics, K actors, B batch, N states, O observation, A action, S state.
-Protocol: `contract`, "Measuring bias"; Fujimoto et al. 2018 (TD3), section 4.1.
+Whom we follow: Fujimoto et al. 2018 (TD3), section 4.1, who compare Q with the returns
+of 1 000 episodes. Here the states are fewer and the truth is exact.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from . import arm
-from .dnddpg import choose_actor, make_env, stream, td_target, to_env
+from .dnddpg import PROBE_TASKS, choose_actor, make_env, stream, td_target, to_env
 
 STEPS = 500  # horizon of the truth
 NEGLIGIBLE = 1e-7  # a reward of smaller weight is lost in float32: the sum stops there
@@ -51,7 +53,9 @@ STARTS = 100  # fresh starts where the dynamics are vectorised
 RECENT = 60  # kept states where the dynamics are vectorised (MuJoCo: all 64)
 EPISODES_MUJOCO = 5
 EPISODES_OTHER = 10
-SUCCESS_STEPS = 50  # Arm: success is more than so many steps in a row on the goal
+PORTION = 420  # states in one rollout of `true_q`: what the processor's cache holds
+PARTS_EQUATIONS = 10  # so many times in a run everything is measured
+PARTS_MUJOCO = 4
 
 
 # ---------------------------------------------------------------------------
@@ -78,10 +82,11 @@ class Dynamics:
         self.env = make_env(config)
         self.task = self.env.unwrapped
         self.space = self.env.action_space
-        self.limit = self.env.spec.max_episode_steps
+        self.limit = self.env.spec.max_episode_steps or self.steps
+        self.rng = np.random.default_rng(0)  # for a task with chance in its steps
 
     def reset(self, rng, n):
-        starts = []
+        self.rng, starts = rng, []
         for seed in rng.integers(2**31, size=n):
             self.env.reset(seed=int(seed))
             starts.append(np.asarray(self.task.state, np.float64).ravel())
@@ -162,6 +167,21 @@ class Arm(Dynamics):
         return states[:, 4]
 
 
+class Probe(Dynamics):
+    """The tiny tasks of `probes.py`, which bring their own equations."""
+
+    def __init__(self, config):
+        super().__init__(config)
+        self.observe = self.task.observe
+        states = self.reset(self.rng, 100)
+        self.low, self.high = states.min(axis=0), states.max(axis=0)
+        self.rest = np.zeros(states.shape[1])
+        self.names = ("position", "velocity")[: len(self.rest)]
+
+    def step(self, states, action):
+        return self.task.dynamics(states, to_env(action, self.space), self.rng)
+
+
 class Simulator(Dynamics):
     """A MuJoCo task: one simulator that takes N states in turn, one step each.
 
@@ -211,6 +231,7 @@ VECTORISED = {
     "MountainCarContinuous-v0": MountainCar,
     "ArmEasy-v0": Arm,
     "ArmHard-v0": Arm,
+    **dict.fromkeys(PROBE_TASKS, Probe),
 }
 
 
@@ -227,7 +248,7 @@ def dynamics(config):
 def greedy(agent, rule=None):
     """The policy that is measured: obs (B, O) -> action (B, A), without noise.
 
-    `rule` names how one of the K actors is chosen (Eq. 12); None: `act_rule`.
+    `rule` names how one of the K actors is chosen (Eq. (12)); None: `act_rule`.
     """
     if rule is None or rule == agent.config.act_rule:
         return agent.act
@@ -274,7 +295,7 @@ def rollout(world, states, policy, gamma, steps=None, first_action=None):
             counter = world.on_goal(states)
             arrival = np.where(counter > 0, t + 1, limit)
             steps_to_goal[rows] = np.minimum(steps_to_goal[rows], arrival)
-            success[rows] |= counter > SUCCESS_STEPS
+            success[rows] |= counter > arm.HOLD
         if terminated.any():
             ended[rows[terminated]] = True
             rows, states = rows[~terminated], states[~terminated]
@@ -299,23 +320,26 @@ def largest_tail(gamma, steps, largest):
 def true_q(world, states, action, agent, rule=None):
     """Q^pi(s, a) of N states (N, S) and actions (N, A) in [-1, 1]: (N,)."""
     policy, gamma = greedy(agent, rule), agent.config.gamma
-    return rollout(world, states, policy, gamma, first_action=action)["truth"]
+    truth = []
+    for start in range(0, len(states), PORTION):
+        part = slice(start, start + PORTION)
+        found = rollout(world, states[part], policy, gamma, None, action[part])
+        truth.append(found["truth"])
+    return np.concatenate(truth)
 
 
-def walk(env, obs, policy, steps, first_action=None):
-    """Step one environment from obs (O,), at most `steps` steps.
+def walk(env, policy, seed, steps):
+    """One episode, at most `steps` steps.
 
     Returns obs (T, O), action (T, A) in [-1, 1], reward (T,), terminated.
     """
-    observations, actions, rewards, terminated = [], [], [], False
-    for t in range(steps):
-        obs = np.asarray(obs, np.float32)
-        action = policy(obs) if t > 0 or first_action is None else first_action
-        observations.append(obs)
-        actions.append(action)
-        obs, reward, terminated, truncated, _ = env.step(
-            to_env(action, env.action_space)
-        )
+    obs, _ = env.reset(seed=int(seed))
+    observations, actions, rewards = [], [], []
+    for _ in range(steps):
+        observations.append(np.asarray(obs, np.float32))
+        actions.append(policy(observations[-1]))
+        action = to_env(actions[-1], env.action_space)
+        obs, reward, terminated, truncated, _ = env.step(action)
         rewards.append(reward)
         if terminated or truncated:
             break
@@ -413,6 +437,7 @@ def measure_operator(agent, obs, truth=None):
         by_pair = covariance.transpose(0, 2, 1, 3)  # (c, d, k, l)
         variance = by_pair[same_c][:, same_k].mean()
         out["sigma"] = float(np.sqrt(variance))
+        variance = variance if variance > 0 else np.nan  # no error, no correlation
         if critics > 1:
             out["kappa"] = float(by_pair[~same_c][:, same_k].mean() / variance)
         if actors > 1:
@@ -420,45 +445,48 @@ def measure_operator(agent, obs, truth=None):
     return out
 
 
-def evaluate(training, kept=None):
+def evaluate(training, full=None):
     """Measure return and bias of `training.agent`, now.
 
     Pure: it depends on the agent, the step, the seed and `training.kept` only, and it
     touches neither the environment of `training` nor its generators. Starts are drawn
     from stream(seed, "evaluation", step).
 
-    `kept` says whether MuJoCo's kept states are measured (64 states, 2 x 500 steps
-    each: slow). None: at the first evaluation at or after 25, 50, 75 and 100 % of
-    `config.steps`. Without `config.steps` the caller must say so.
+    `full` says whether what is slow is measured, too: on MuJoCo the bias on the kept
+    states; on the other tasks sigma, kappa and rho (else NaN), and with two actors
+    the bias under the other rule (else no rows). None: at the first evaluation at or
+    after 25, 50, 75 and 100 % of `config.steps` on MuJoCo, 10, 20, ... 100 % on the
+    others; never if the run has no `config.steps`.
     """
     config, agent = training.config, training.agent
     common = {"task": config.task, "algorithm": config.algorithm, "seed": config.seed}
     common |= {"step": training.step, "updates": training.updates}
     rng = stream(config.seed, "evaluation", training.step)
     world = dynamics(config)
-    if kept is None:
-        kept = _at_a_quarter(config, training.step)
-    with threadpool_limits(1):
-        if world is not None:
-            return _by_equations(agent, common, rng, training.kept, world)
-        return _by_simulator(agent, common, rng, training.kept, kept)
+    if full is None:
+        parts = PARTS_MUJOCO if world is None else PARTS_EQUATIONS
+        full = _reaches_a_part(config, training.step, parts)
+    with threadpool_limits(1):  # one run, one thread
+        if world is None:
+            return _by_episodes(agent, common, rng, training.kept, full)
+        return _by_equations(agent, common, rng, training.kept, full, world)
 
 
-def _at_a_quarter(config, step):
-    """Is this the first evaluation at or after 25, 50, 75 or 100 % of the run?"""
+def _reaches_a_part(config, step, parts):
+    """Is this the first evaluation at or after 1/parts, 2/parts, ... of the run?"""
     if config.steps is None:
         return False
     before = max(step - config.evaluate_every, 0)
-    return 4 * step // config.steps > 4 * before // config.steps
+    return parts * step // config.steps > parts * before // config.steps
 
 
-def _by_equations(agent, common, rng, kept, world):
+def _by_equations(agent, common, rng, kept, full, world):
     """100 fresh starts and the last 60 kept states. Standard errors are over states.
 
     One rollout holds, side by side: both kinds of states with the policy's own action,
-    the kept states with the replayed action, and (for sigma, kappa, rho) the kept
-    states with each slow actor's action. With two actors there is a second one, for
-    the other rule: the policy's own action only.
+    the kept states with the replayed action, and, if `full`, the kept states with each
+    slow actor's action (for sigma, kappa, rho). With two actors and `full` there is a
+    second one, for the other rule: the policy's own action only.
     """
     config, kept = agent.config, kept[-RECENT:]
     n, width = len(kept), world.space.shape[0]
@@ -467,7 +495,7 @@ def _by_equations(agent, common, rng, kept, world):
     replayed = np.array([k["action"] for k in kept]).reshape(n, width)
     obs_recent = world.observe(recent)
     rules = [config.act_rule]
-    if config.actors > 1:
+    if full and config.actors > 1:
         rules += [r for r in ("paired", "max_min") if r != config.act_rule]
 
     rows = []
@@ -479,6 +507,7 @@ def _by_equations(agent, common, rng, kept, world):
         }
         if rule == config.act_rule:
             parts["recent", "replay"] = recent, replayed
+        if rule == config.act_rule and full:
             for k, action in enumerate(agent.actions(obs_recent, slow=True)):
                 parts["slow", k] = recent, action
         found = rollout(
@@ -509,12 +538,12 @@ def _by_equations(agent, common, rng, kept, world):
         evaluation["success"] = float(own["success"][:STARTS].mean())
         evaluation["steps_to_goal"] = float(steps.mean())
         evaluation["regret"] = summary(regret[in_reach])[0]
-    operator = measure_operator(agent, obs_recent, np.array(slow))
+    operator = measure_operator(agent, obs_recent, np.array(slow) if full else None)
     return Measurement(evaluation, rows, operator, own["tail"])
 
 
-def _by_simulator(agent, common, rng, kept, measure_kept):
-    """Whole episodes, and on MuJoCo the kept states. See `evaluate`.
+def _by_episodes(agent, common, rng, kept, full):
+    """Whole episodes, and on MuJoCo, if `full`, the kept states.
 
     On-policy: a state of the first 500 steps, with the discounted rewards that follow
     it in the same episode; the time limit is passed over, so that at least 500 steps
@@ -532,8 +561,7 @@ def _by_simulator(agent, common, rng, kept, measure_kept):
     returns, q_means, truth_means, largest = [], [], [], 0.0
     episodes = EPISODES_MUJOCO if simulator else EPISODES_OTHER
     for seed in rng.integers(2**31, size=episodes):
-        obs, _ = endless.reset(seed=int(seed))
-        walked = walk(endless, obs, agent.act, max(limit, 2 * STEPS))
+        walked = walk(endless, agent.act, seed, max(limit, 2 * STEPS))
         obs, action, reward, terminated = walked
         returns.append(reward[:limit].sum())
         largest = max(largest, np.abs(reward).max())
@@ -552,7 +580,7 @@ def _by_simulator(agent, common, rng, kept, measure_kept):
     on_policy = labels | {"states": "on_policy", "action": "policy"}
     rows = bias_rows(on_policy, q, np.array(truth_means))
     obs = np.array([k["obs"] for k in kept]).reshape(len(kept), agent.obs_dim)
-    if len(kept) > 0 and (measure_kept or not simulator):
+    if len(kept) > 0 and (full or not simulator):
         actions = {"policy": agent.act(obs)}
         actions["replay"] = np.array([k["action"] for k in kept])
         truths = dict.fromkeys(actions, np.full(len(kept), np.nan))
@@ -640,12 +668,12 @@ def owed(updates, values, config):
 
 
 def max_of_two_actions(rho):
-    """E max over two actions, one critic. Eq. 5 (Thrun and Schwartz 1993)."""
+    """E max over two actions, one critic. Eq. (5), Thrun and Schwartz 1993."""
     return np.sqrt((1 - rho) / np.pi)
 
 
 def min_of_two_critics(kappa):
-    """E min over two critics at one action: `single`. Eq. 11."""
+    """E min over two critics at one action: `single`. Eq. (11)."""
     return -np.sqrt((1 - kappa) / np.pi)
 
 
@@ -655,7 +683,7 @@ def paired_min(kappa, rho):
 
 
 def paired_max(kappa, rho):
-    """E max of e[1, 1] and e[2, 2]: what Eq. 12 believes of its own choice."""
+    """E max of e[1, 1] and e[2, 2]: what Eq. (12) believes of its own choice."""
     return np.sqrt((1 - kappa * rho) / np.pi)
 
 
@@ -666,6 +694,7 @@ def max_of_all(kappa, rho):
     that e_i = e_j); that probability is 1/4 + arcsin(r) / 2 pi, r the correlation of
     the two gaps to the others.
     """
+    kappa, rho = min(kappa, 1 - 1e-12), min(rho, 1 - 1e-12)  # no two exactly equal
     critics, actors = np.array([[1, kappa], [kappa, 1]]), np.array([[1, rho], [rho, 1]])
     cov = np.kron(critics, actors)  # (4, 4)
     total = 0.0
@@ -677,8 +706,6 @@ def max_of_all(kappa, rho):
             gap[1:, [i, j]] = 0.5
             gap[[1, 2], others] = -1
             c = gap @ cov @ gap.T
-            if c[0, 0] < 1e-12:  # two equal errors: neither is above the other
-                continue
             c = c[1:, 1:] - np.outer(c[1:, 0], c[0, 1:]) / c[0, 0]  # given a tie
             scale = np.sqrt(max(c[0, 0] * c[1, 1], 0.0))
             r = np.clip(c[0, 1] / scale, -1, 1) if scale > 1e-12 else 1.0
@@ -706,7 +733,7 @@ def soft(kappa, rho, nu):
 
 
 def selected(kappa, rho):
-    """`selected`: the action by Eq. 12, then the min over critics at that action."""
+    """`selected`: the action by Eq. (12), then the min over critics at that action."""
     spread = np.sqrt(np.pi * max(1 - kappa * rho, 1e-12))
     return (1 - rho) * (1 + kappa) / (2 * spread) + min_of_two_critics(kappa)
 

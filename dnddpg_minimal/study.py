@@ -1,25 +1,29 @@
 """The recorded study: which runs there are, doing them, resuming them, loading them.
 
 A run is a `Config`, a `variant` that names what is special about it, and perhaps one of
-the faulty trainings of bugs.py. Its record is one small file,
+the faulty trainings of bugs.py. Its record is one small file, written whole or not at
+all:
 
     recordings/<task>/<variant>/<algorithm>-<seed>.npz
 
-written whole or not at all. A study does the runs whose record is missing, and no
-others. Killed by any means and started again, it goes on where it was, bit for bit.
+A study does the runs whose record is missing, and no others. Killed by any means and
+started again, it goes on where it was, bit for bit.
 
 | call | meaning |
 |---|---|
-| `list_of("quick" or "class" or "paper")` | the list of runs, in the order of doing |
+| `list_of("quick")`, `"class"`, `"paper"` | the runs of a budget, in order of doing |
 | `record(run, folder)` | do one run, write its record |
 | `study(runs, folder, ...)` | do those that are missing, on processes or a cluster |
-| `load_study(task, algorithm, ...)` | what was recorded, as tables |
+| `load_study(task, algorithm, ...)` | what was recorded, as tables and arrays |
+| `score(table, column)` | one number per run: the mean of its last evaluations |
 | `load_agent_at(weights, i)` | an agent from recorded weights |
+| `film(task, algorithm, ...)` | a GIF and a PNG of a recorded agent |
 
-On several machines the study talks to a Dask scheduler (`--scheduler`): recordings'
-README says how. It speaks to `concurrent.futures.Executor` only.
+`python -m dnddpg_minimal study --help` is the command; recordings/README.md says how to
+use it on one machine and on several.
 """
 
+import gc
 import hashlib
 import itertools
 import json
@@ -31,7 +35,6 @@ import sys
 import threading
 import time
 import warnings
-import zipfile
 from collections import Counter, deque
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -48,6 +51,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
+from threadpoolctl import threadpool_info
 
 from dnddpg_minimal import bias
 from dnddpg_minimal.dnddpg import (
@@ -67,6 +71,9 @@ TASKS = (*SMALL, "MountainCarContinuous-v0", *MUJOCO_TASKS)  # small ones first
 CHECKPOINT_EVERY = 75  # seconds, then at the next episode's end
 PROBE_STEP = 2_000  # a test repeats a run so far, and compares the weights
 PICTURES_AT = (0.1, 0.25, 0.5, 1.0)  # of the steps: planes and weights
+FILMED = [f"{task}/class/DN-DDPG-0" for task in TASKS]  # agents with a film
+FILMED += [f"{task}/class/{algorithm}-0" for task in (*SMALL, "HalfCheetah-v5")
+           for algorithm in ("DDPG", "DCN-DDPG")] + ["ArmEasy-v0/bonus/DN-DDPG-0"]
 BINS = 40  # of the histogram of visited states, in each direction
 DEATHS = 3  # a run whose process died so often is given up
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS",
@@ -83,21 +90,21 @@ class Run(NamedTuple):
 
     @property
     def name(self):
-        return (f"{self.config.task}/{self.variant}/"
-                f"{self.config.algorithm}-{self.config.seed}")
+        config = self.config
+        return f"{config.task}/{self.variant}/{config.algorithm}-{config.seed}"
 
 
-def list_of(name):
+def list_of(budget):
     """The runs of a budget, in the order of doing: seed 0 of everything first.
 
     quick  every task and algorithm, seconds each: does everything work?
     class  what is recorded and shipped
-    paper  section 4.3 of the paper: Table 1, 2 000 and 5 000 episodes, ten seeds
+    paper  section 4.3 of the paper: Table 1, 2 000 or 5 000 episodes; ten seeds
     """
     lists = {"quick": _quick, "class": _class, "paper": _paper}
-    if name not in lists:
-        raise ValueError(f"budget={name!r}: expected one of {', '.join(lists)}.")
-    return sorted(lists[name](),
+    if budget not in lists:
+        raise ValueError(f"budget={budget!r}: expected one of {', '.join(lists)}.")
+    return sorted(lists[budget](),
                   key=lambda run: (run.config.seed, TASKS.index(run.config.task)))
 
 
@@ -119,41 +126,38 @@ def _paper():
 def _class():
     from dnddpg_minimal.bugs import ABLATIONS, BUGS
 
-    pendulum, car, cheetah, arm = TASKS[:1], TASKS[3:4], MUJOCO_TASKS[:1], TASKS[1:2]
-    others = ("Hopper-v5", "Walker2d-v5")
-    ddpg, dn = ("DDPG",), ("DN-DDPG",)
-    large = dict(steps=50_000, hidden=(400, 300), batch_size=256)
-    slow = dict(tau=0.01, target_every=10)
+    pendulum, arm, car, cheetah = TASKS[:1], TASKS[1:2], TASKS[3:4], MUJOCO_TASKS[:1]
+    hopper, walker, humanoid = (MUJOCO_TASKS[i:i + 1] for i in (1, 2, 3))
+    ddpg, dcn, dn = ((name,) for name in ALGORITHMS)
     short = dict(steps=20_000)
-    frozen = dict(steps=200_000, freeze_actors_after=100_000)
+    slow = dict(tau=0.01, target_every=10)
     success = dict(success_terminates=True)
     bonus = dict(success, reward="distance_and_bonus")
+    frozen = dict(steps=200_000, freeze_actors_after=100_000)
+    large = dict(steps=50_000, hidden=(400, 300), batch_size=256)
 
-    runs = _many(10, SMALL, ALGORITHMS, "class")
-    runs += _many(5, car, ALGORITHMS, "class")
-    runs += _many(10, (*cheetah, *others), ALGORITHMS, "class")
-    runs += _many(5, ("Humanoid-v5",), ALGORITHMS, "class")
+    runs = _many(10, (*SMALL, *cheetah, *hopper, *walker), ALGORITHMS, "class")
+    runs += _many(5, (*car, *humanoid), ALGORITHMS, "class")
     # The choices of readings.md, one at a time
     for field, values in (("target_rule", ("single", "paired_min", "selected", "soft")),
                           ("act_rule", ("max_min", "first")), ("climbs", ("first",)),
-                          ("y_min", (-20.0,))):
+                          ("y_min", (-20,))):
         for value in values:
-            name = value if isinstance(value, str) else f"{value:g}"
             choice = {field: value}
-            runs += _many(10, pendulum, dn, f"{field}={name}", **choice, **short)
+            runs += _many(10, pendulum, dn, f"{field}={value}", **choice, **short)
     runs += _many(10, pendulum, ALGORITHMS, "slow=paper", **slow, **short)
     runs += _many(3, car, ALGORITHMS, "noise=gaussian", noise="gaussian", sigma=0.1)
     for ends in ("none", "any_end"):
-        runs += _many(5, (*car, "Hopper-v5"), ddpg, f"ends={ends}", ends=ends)
+        runs += _many(5, (*car, *hopper), ddpg, f"ends={ends}", ends=ends)
         runs += _many(5, arm, ddpg, f"success_terminates,ends={ends}", ends=ends,
                       task_options=success)
     runs += _many(5, arm, ddpg, "success_terminates", task_options=success)
     runs += _many(5, arm, dn, "bonus", task_options=bonus, gamma=0.99)
     # Controls: networks as many weights as DN's, twice the updates, frozen actors
     runs += _many(10, pendulum, ddpg, "hidden=92-92", hidden=(92, 92))
-    runs += _many(10, pendulum, ("DCN-DDPG",), "updates_per_step=2", updates_per_step=2)
-    runs += _many(1, (*cheetah, "Hopper-v5"), ALGORITHMS, "frozen", **frozen)
-    runs += _many(1, ("Walker2d-v5", "Humanoid-v5"), dn, "frozen", **frozen)
+    runs += _many(10, pendulum, dcn, "updates_per_step=2", updates_per_step=2)
+    runs += _many(1, (*cheetah, *hopper), ALGORITHMS, "frozen", **frozen)
+    runs += _many(1, (*walker, *humanoid), dn, "frozen", **frozen)
     # Chapters 03 and 12
     for name, fields in ABLATIONS.items():
         runs += _many(5, pendulum, ddpg, f"ablation={name}", **fields, **short)
@@ -170,14 +174,16 @@ def _class():
 # --- 2. One run -----------------------------------------------------------------------
 
 
-def record(run, folder, scratch=None, stop=None, every=CHECKPOINT_EVERY):
+def record(run, folder, scratch=None, stop=None, every=CHECKPOINT_EVERY, write=True):
     """Do one run, or go on with it, and write its record into `folder`.
 
-    Returns (what, data). `what` is "done", "stopped" (`stop`, an Event, was set; the
-    checkpoint is written) or "busy" (another process is doing this run). `data` holds
-    the record's arrays for a caller on another machine, or None. Checkpoints are in
-    `scratch`, by default in the user's cache folder, and made at the first episode's
-    end after `every` seconds.
+    Checkpoints go to `scratch`, by default in the user's cache folder, at the first
+    episode's end after `every` seconds. Returns (what, arrays); `what` is
+
+        "done"     `arrays` are the record's, or None if it was there already;
+                   with `write=False` the caller writes them
+        "stopped"  `stop`, an Event, was set; the checkpoint is written
+        "busy"     another process is doing this run
     """
     path = Path(folder) / f"{run.name}.npz"
     checkpoint = Checkpoint(run, folder, scratch)
@@ -189,12 +195,11 @@ def record(run, folder, scratch=None, stop=None, every=CHECKPOINT_EVERY):
             return "done", None
         checkpoint.sweep(path)
         training, notes = checkpoint.load()
-        started = saved = shown = time.monotonic()
+        last = saved = shown = time.monotonic()
         for item in training:
             measure(run, training, item, notes)
             now = time.monotonic()
-            notes.seconds += now - started
-            started = now
+            notes.seconds, last = notes.seconds + now - last, now
             if now - shown > 2:
                 checkpoint.show(training)
                 shown = now
@@ -204,11 +209,12 @@ def record(run, folder, scratch=None, stop=None, every=CHECKPOINT_EVERY):
             if item.kind == "episode" and now - saved > every:
                 checkpoint.save(training, notes)
                 saved = time.monotonic()
-        data = finish(run, training, notes)
-        if Path(folder).is_dir():  # not so on a cluster without a common folder
-            write_record(path, data)
+        training.env.close()
+        arrays = finish(run, training, notes)
+        if write:
+            write_record(path, arrays)
         checkpoint.remove()
-        return "done", data
+        return "done", arrays
 
 
 class Notes:
@@ -218,9 +224,9 @@ class Notes:
         self.evaluations, self.bias, self.probe, self.seconds = [], [], None, 0.0
         self.pictures = {}  # step: dict of arrays
 
-    def save(self, path, **more):
+    def save(self, path):
         rows = dict(evaluations=self.evaluations, bias=self.bias, probe=self.probe,
-                    seconds=self.seconds, **more)
+                    seconds=self.seconds, code=code())
         arrays = {f"{step}/{name}": array for step, arrays in self.pictures.items()
                   for name, array in arrays.items()}
         write_npz(path, rows=json.dumps(rows), **arrays)
@@ -230,6 +236,8 @@ class Notes:
         """The notes up to the step `until`: later ones will be made again."""
         content, notes = read_npz(path), cls()
         rows = json.loads(str(content.pop("rows")))
+        if rows["code"] != code():
+            raise ValueError("written by other code: the rest would be of another kind")
         notes.evaluations = [row for row in rows["evaluations"] if row["step"] <= until]
         notes.bias = [row for row in rows["bias"] if row["step"] <= until]
         notes.probe = rows["probe"] if until >= PROBE_STEP else None
@@ -238,39 +246,59 @@ class Notes:
             step, _, name = name.partition("/")
             if int(step) <= until:
                 notes.pictures.setdefault(int(step), {})[name] = array
-        return notes, rows
+        return notes
 
 
 def measure(run, training, item, notes):
-    """Look at the run at one of its records; does not touch it."""
+    """Look at the run at one of its records `item`, and note it. Changes no run."""
     config, step = run.config, training.step
     if step == PROBE_STEP and notes.probe is None:
-        theta = np.asarray(training.agent.arrays()["theta"])
-        notes.probe = dict(step=step, sum=float(theta.sum(dtype=np.float64)),
-                           sha256=hashlib.sha256(theta.tobytes()).hexdigest())
+        notes.probe = fingerprint(training)
     if item.kind != "grid":
         return
-    kept = None
+    full = None
     if config.episodes is not None:  # then bias.evaluate can't know the quarters
         quarter = 4 * training.episode // config.episodes
-        kept = quarter > (notes.evaluations[-1]["quarter"] if notes.evaluations else 0)
-    found = bias.evaluate(training, kept)
+        full = quarter > (notes.evaluations[-1]["quarter"] if notes.evaluations else 0)
+    found = bias.evaluate(training, full)
     row = found.evaluation | {"tail": found.tail}
-    row |= {name: found.operator[name] for name in
-            ("delta", "sigma", "kappa", "rho", "actor_distance")}
+    row |= {name: value for name, value in found.operator.items() if name != "n"}
     for name, losses in (("critic", item.critic_loss), ("actor", item.actor_loss)):
         row |= {f"{name}_loss_{i}": loss for i, loss in enumerate(losses)}
     if config.episodes is not None:
         row["quarter"] = quarter
     notes.evaluations.append(_plain(row))
     notes.bias += [_plain(row) for row in found.bias]
-    pictured = run.variant == "class" and config.task in SMALL
-    if pictured and step in {round(part * config.steps) for part in PICTURES_AT}:
-        picture = bias.plane(training.agent, bias.dynamics(config))
-        arrays = {name: picture[name] for name in ("x", "y", "q", "truth")}
-        if config.seed < 3:
-            arrays["theta"] = training.agent.arrays()["theta"]
-        notes.pictures[step] = {name: np.float16(a) for name, a in arrays.items()}
+    arrays = pictures(run, training.agent, step)
+    if arrays:
+        kinds = {"x": np.float32, "y": np.float32}
+        notes.pictures[step] = {name: kinds.get(name, np.float16)(array)
+                                for name, array in arrays.items()}
+
+
+def fingerprint(training):
+    """The weights in few words: a dict that is equal only if they are, bit for bit."""
+    theta = np.asarray(training.agent.arrays()["theta"])
+    return dict(step=training.step, sum=float(theta.sum(dtype=np.float64)),
+                sha256=hashlib.sha256(theta.tobytes()).hexdigest())
+
+
+def pictures(run, agent, step):
+    """What a record holds besides numbers: the error plane, and weights.
+
+    Of the `class` runs of Pendulum and the Arms at 10, 25, 50 and 100 %; of the other
+    agents that the films show, the weights at the end.
+    """
+    config, arrays = run.config, {}
+    if run.variant == "class" and config.task in SMALL:
+        if step in {round(part * config.steps) for part in PICTURES_AT}:
+            plane = bias.plane(agent, bias.dynamics(config))
+            arrays = {name: plane[name] for name in ("x", "y", "q", "truth")}
+            if config.seed < 3:
+                arrays["theta"] = agent.arrays()["theta"]
+    elif run.name in FILMED and step == config.steps:
+        arrays["theta"] = agent.arrays()["theta"]
+    return arrays
 
 
 def _plain(row):
@@ -280,7 +308,7 @@ def _plain(row):
 
 
 def finish(run, training, notes):
-    """The record of a run that is over: a dict of arrays."""
+    """The record of a run that is over: a dict of arrays; `meta` says what is what."""
     config, agent = run.config, training.agent
     owed_to(notes.bias, config)
     episodes = [(r.step, r.length, r.episode_return) for r in training.records
@@ -289,7 +317,7 @@ def finish(run, training, notes):
                 obs_dim=agent.obs_dim, action_dim=agent.action_dim,
                 steps=training.step, updates=training.updates, probe=notes.probe,
                 seconds=round(notes.seconds, 1), versions=versions(),
-                processor=processor(), revision=revision(), code=code())
+                processor=processor(), blas=blas(), revision=revision(), code=code())
     arrays = dict(first_losses=np.float32(training.first_losses),
                   episodes=np.float32(episodes).reshape(-1, 3))
     for name, rows in (("evaluations", notes.evaluations), ("bias", notes.bias)):
@@ -301,21 +329,21 @@ def finish(run, training, notes):
         if labels:
             arrays[f"{name}_labels"] = np.array([[r[n] for n in labels] for r in rows])
     if notes.pictures:
-        pictures = [notes.pictures[step] for step in sorted(notes.pictures)]
+        in_order = [notes.pictures[step] for step in sorted(notes.pictures)]
         arrays["picture_steps"] = np.array(sorted(notes.pictures))
-        for name in pictures[0]:
-            arrays[f"picture_{name}"] = np.stack([one[name] for one in pictures])
-    visited = visits(config.task, training.replay)
-    if visited is not None:
-        arrays["visits"] = visited
+        for name in in_order[0]:
+            arrays[f"picture_{name}"] = np.stack([one[name] for one in in_order])
+    if config.task in PLANES:
+        arrays["visits"] = visits(config.task, training.replay)
     return dict(meta=json.dumps(meta), **arrays)
 
 
 def owed_to(rows, config):
     """Add to each row of bias what is owed to lag alone (bias.owed), in place.
 
-    V is the truth at the policy's action, over the same kind of states. MuJoCo's kept
-    states are measured four times only: there V is that of the on-policy states.
+    V is the truth at the policy's action, over the same kind of states. What is not
+    measured at every evaluation borrows V: the other rule's from the rule that acts,
+    that of MuJoCo's kept states from the on-policy states.
     """
     series = {}  # (rule, states): {updates: truth}
     for row in rows:
@@ -324,16 +352,17 @@ def owed_to(rows, config):
             if np.isfinite(row["truth"]):
                 known[row["updates"]] = row["truth"]
     found = {}
-    for (rule, states), own in series.items():
-        usual = series.get((rule, "on_policy"), own)
-        values = usual if len(usual) > len(own) else own
+    for rule, states in series:
+        acts = config.act_rule
+        candidates = (rule, states), (acts, states), (acts, "on_policy")
+        values = max((series.get(kind, {}) for kind in candidates), key=len)
         owed = bias.owed(np.array([*values]), np.array([*values.values()]), config)
         found[rule, states] = dict(zip(values, owed.tolist(), strict=True))
     for row in rows:
         row["owed"] = found[row["rule"], row["states"]].get(row["updates"], np.nan)
 
 
-PLANES = {  # task: what a histogram of visits shows, from obs; its ranges
+PLANES = {  # task: (x, y) of a state in the histogram of visits, from obs; their ranges
     "Pendulum-v1": (lambda obs: (np.arctan2(obs[:, 1], obs[:, 0]), obs[:, 2]),
                     ((-np.pi, np.pi), (-8.0, 8.0))),
     "MountainCarContinuous-v0": (lambda obs: (obs[:, 0], obs[:, 1]),
@@ -342,29 +371,27 @@ PLANES = {  # task: what a histogram of visits shows, from obs; its ranges
 
 
 def visits(task, replay):
-    """How often each cell of the state plane was visited: (y, x), uint32, or None."""
-    if task not in PLANES:
-        return None
-    project, ranges = PLANES[task]
+    """How many states of the replay memory lie in each cell: (BINS y, BINS x)."""
+    project, (range_x, range_y) = PLANES[task]
     x, y = project(replay.arrays.obs[:replay.size].astype(np.float64))
-    counts, _, _ = np.histogram2d(y, x, bins=BINS, range=ranges[::-1])
+    counts, _, _ = np.histogram2d(y, x, bins=BINS, range=(range_y, range_x))
     return counts.astype(np.uint32)
 
 
-# --- 3. Checkpoints, locks, files -----------------------------------------------------
+# --- 3. Checkpoints, locks, and where a record comes from -----------------------------
 
 
 def default_scratch():
     """Where checkpoints lie: the user's cache folder, never the work tree."""
     home = Path.home()
-    places = {"win32": os.environ.get("LOCALAPPDATA", home / "AppData" / "Local"),
+    places = {"win32": os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local",
               "darwin": home / "Library" / "Caches"}
     usual = os.environ.get("XDG_CACHE_HOME") or home / ".cache"
     return Path(places.get(sys.platform, usual)) / "dnddpg_minimal"
 
 
 class Checkpoint:
-    """The files of one unfinished run: its Training, what was measured, a lock."""
+    """The files of one unfinished run: its Training, its Notes, its lock."""
 
     def __init__(self, run, folder, scratch=None):
         self.run = run
@@ -377,22 +404,19 @@ class Checkpoint:
             ("training.npz", "notes.npz", "lock", "status"))
 
     def save(self, training, notes):
-        # In this order: notes may know more than the Training, never less
-        notes.save(self.notes, code=code())
+        notes.save(self.notes)  # first: notes may know more than the Training, not less
         training.save(self.training)
 
     def load(self):
-        """Training and notes as they were saved, or new ones.
+        """Training and Notes as they were saved; new ones if there are none of use."""
+        kind = Training
+        if self.run.bug is not None:
+            from dnddpg_minimal.bugs import BUGS
 
-        New, too, if the files are damaged, or if other code wrote them: what follows
-        would not be what this code makes.
-        """
-        kind = training_class(self.run.bug)
+            kind = BUGS[self.run.bug][2]
         with suppress(FileNotFoundError, ValueError, KeyError):
             training = kind.load(self.training)
-            notes, more = Notes.load(self.notes, training.step)
-            if more["code"] == code() and training.config == self.run.config:
-                return training, notes
+            return training, Notes.load(self.notes, training.step)
         return kind(self.run.config), Notes()
 
     def show(self, training):
@@ -404,6 +428,7 @@ class Checkpoint:
             self.status.write_text(f"{part:.4f}")
 
     def progress(self):
+        """What `show` said last, 0 to 1."""
         with suppress(OSError, ValueError):
             return float(self.status.read_text())
         return 0.0
@@ -417,14 +442,6 @@ class Checkpoint:
     def remove(self):
         for path in (self.training, self.notes, self.status):
             path.unlink(missing_ok=True)
-
-
-def training_class(bug):
-    if bug is None:
-        return Training
-    from dnddpg_minimal.bugs import BUGS
-
-    return BUGS[bug][2]
 
 
 @contextmanager
@@ -454,7 +471,7 @@ def write_record(path, arrays):
 
 def versions():
     found = {"python": platform.python_version()}
-    for name in ("numpy", "gymnasium", "mujoco", "torch"):
+    for name in ("numpy", "gymnasium", "mujoco"):
         with suppress(PackageNotFoundError):
             found[name] = version(name)
     return found
@@ -468,6 +485,12 @@ def processor():
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+def blas():
+    """The kernels that multiply matrices here: other ones round otherwise."""
+    return [f"{one['internal_api']} {one['version']} {one.get('architecture')}"
+            for one in threadpool_info() if one["user_api"] == "blas"]
 
 
 @cache
@@ -495,11 +518,14 @@ class Slot:
 
     room = 1
 
-    def __init__(self, stop, nice):
-        self.start = lambda: ProcessPoolExecutor(
+    def __init__(self, nice):
+        self.stop, self.nice, self.running = get_context("spawn").Event(), nice, 0
+        self.renew()
+
+    def renew(self):
+        self.executor = ProcessPoolExecutor(
             1, mp_context=get_context("spawn"), initializer=_start_worker,
-            initargs=(stop, nice))
-        self.executor, self.running = self.start(), 0
+            initargs=(self.stop, self.nice))
 
     def submit(self, *call):
         try:
@@ -508,9 +534,11 @@ class Slot:
             self.renew()
             return self.executor.submit(*call)
 
-    def renew(self):
-        self.executor.shutdown(wait=False)
-        self.executor = self.start()
+    def ask_to_stop(self):
+        self.stop.set()
+
+    def close(self):
+        self.executor.shutdown(wait=True, cancel_futures=True)
 
 
 class Cluster:
@@ -521,12 +549,18 @@ class Cluster:
     def __init__(self, address):
         from distributed import Client
 
-        self.client, self.running = Client(address), 0
+        self.client, self.running = Client(address, timeout=30), 0
         self.executor = self.client.get_executor(pure=False)
         self.submit = self.executor.submit
 
     def renew(self):
         pass
+
+    def ask_to_stop(self):
+        self.executor.shutdown(wait=False)  # a run that has begun goes on to its end
+
+    def close(self):
+        self.client.close()
 
 
 _stop = None  # in a worker: the Event by which the study asks it to stop
@@ -535,6 +569,7 @@ _stop = None  # in a worker: the Event by which the study asks it to stop
 def _start_worker(stop, nice):
     global _stop
     _stop = stop
+    code(), revision()  # now: the files may change while we run
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the study hears Ctrl-C, and tells
     if hasattr(os, "nice"):
         os.nice(nice)
@@ -547,27 +582,28 @@ def _start_worker(stop, nice):
 
 
 def _work(run, folder, scratch, every):
-    return record(run, folder, scratch, _stop, every)
+    gc.collect()  # the last run's replay memory may be 290 MB
+    common = Path(folder).is_dir()  # False on a cluster without a common folder
+    return record(run, folder, scratch, _stop, every, write=common)
 
 
 def study(runs, folder=RECORDINGS, scratch=None, workers=2, nice=10, scheduler=None,
-          every=CHECKPOINT_EVERY,
-          report=lambda *_: None):
+          every=CHECKPOINT_EVERY, report=lambda done, running: None):
     """Do the runs whose record is missing. → {name: why} of those that failed.
 
-    `report(done, running)` is called about once a second and after each run, with the
-    names of the runs that ended just now and the `Checkpoint`s of those that go on.
-    A run whose process dies is done again, at most three times.
+    `workers` processes do one run each at a time; with `scheduler`, an address, a Dask
+    cluster does them. `report(done, running)` is called about once a second, with the
+    names of the runs that ended just now and the `Checkpoint`s of those that go on. A
+    run whose process dies is done again, at most three times.
     """
     folder = Path(folder).resolve()
     folder.mkdir(parents=True, exist_ok=True)
-    waiting = deque(r for r in runs if not (folder / f"{r.name}.npz").exists())
+    waiting = deque(run for run in runs if not (folder / f"{run.name}.npz").exists())
     failed, deaths, futures = {}, Counter(), {}
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)  # for the workers: read when NumPy is loaded
-    stop = get_context("spawn").Event()
     slots = ([Cluster(scheduler)] if scheduler else
-             [Slot(stop, nice) for _ in range(min(workers, max(1, len(waiting))))])
+             [Slot(nice) for _ in range(min(workers, len(waiting)))])
     try:
         while waiting or futures:
             for slot in slots:
@@ -582,7 +618,10 @@ def study(runs, folder=RECORDINGS, scratch=None, workers=2, nice=10, scheduler=N
                 run, slot = futures.pop(future)
                 slot.running -= 1
                 try:
-                    what, data = future.result()
+                    what, arrays = future.result()
+                    path = folder / f"{run.name}.npz"
+                    if arrays is not None and not path.exists():
+                        write_record(path, arrays)
                 except BrokenExecutor:
                     slot.renew()
                     deaths[run.name] += 1
@@ -596,16 +635,14 @@ def study(runs, folder=RECORDINGS, scratch=None, workers=2, nice=10, scheduler=N
                     if what == "busy":  # done by another study: look again later
                         waiting.append(run)
                         continue
-                    path = folder / f"{run.name}.npz"
-                    if data is not None and not path.exists():
-                        write_record(path, data)
                 done.append(run.name)
             going_on = [run for run, _ in futures.values()]
             report(done, [Checkpoint(run, folder, scratch) for run in going_on])
     finally:
-        stop.set()
         for slot in slots:
-            slot.executor.shutdown(wait=True, cancel_futures=True)
+            slot.ask_to_stop()
+        for slot in slots:
+            slot.close()
         for name, value in before.items():
             os.environ.pop(name) if value is None else os.environ.update({name: value})
     return failed
@@ -614,22 +651,23 @@ def study(runs, folder=RECORDINGS, scratch=None, workers=2, nice=10, scheduler=N
 # --- 5. Loading -----------------------------------------------------------------------
 
 TABLES = ("evaluations", "bias")
-WHAT = (*TABLES, "episodes", "planes", "weights", "visits")
-WHOLE = ("step", "updates", "n", "seed", "quarter")  # columns of whole numbers
+WHAT = (*TABLES, "episodes", "planes", "weights", "visits", "meta")
 
 
 def load_study(task=None, algorithm=None, variant="class", what="evaluations",
-               folder=None):
+               folder=None, rule=None):
     """What was recorded. `None` for task, algorithm or variant means all of them.
 
-    what="evaluations", "bias": one pandas DataFrame.
-    what="episodes", "planes", "weights", "visits": a list of dicts, one per run, each
-    with task, algorithm, variant, seed, and arrays:
+    what="evaluations", "bias": one pandas DataFrame. A bias is that of the policy that
+    acts; `rule="max_min"` or `"paired"` asks for that of the policy that chooses its
+    action so (measured for two actors on Pendulum, MountainCar and the Arms).
+    Anything else: a list of dicts, one per run, with task, algorithm, variant, seed and
 
         episodes  step, length, episode_return                         (E,)
         planes    step (T,), x (N,), y (N,), q (T, C, N, N), truth (T, N, N)
         weights   step (T,), theta (T, P); for `load_agent_at`
         visits    counts (N, N), x (N + 1,) and y (N + 1,), the cells' edges
+        meta      config, versions, processor, seconds, ..., first_losses (20, C)
 
     T times of the run, N points of an axis; pictures have the axes [y, x]. A damaged
     or foreign file is named in a warning and skipped. ValueError for an unknown `what`.
@@ -637,64 +675,56 @@ def load_study(task=None, algorithm=None, variant="class", what="evaluations",
     if what not in WHAT:
         raise ValueError(f"what={what!r}: expected one of {', '.join(WHAT)}.")
     found = []
-    folder = Path(folder or RECORDINGS)
-    for path in folder.glob(f"{task or '*'}/{variant or '*'}/{algorithm or '*'}-*.npz"):
-        if not path.name.startswith("."):
-            with _named(path):
-                found += _read(path, what)
-    found.sort(key=lambda one: _order(one["task"], one["variant"], one["algorithm"],
-                                      one["seed"]))
+    pattern = f"{task or '*'}/{variant or '*'}/{algorithm or '*'}-*.npz"
+    for path in Path(folder or RECORDINGS).glob(pattern):
+        if path.name.startswith("."):  # half written
+            continue
+        try:
+            found += _read(path, what, rule)
+        except Exception as error:  # zipfile and NumPy raise a dozen kinds
+            warnings.warn(f"{path} is skipped: it is damaged, or no record of this "
+                          f"study ({type(error).__name__}: {error})", stacklevel=2)
+    found.sort(key=lambda one: _order(*(one[name] for name in RUN)))
     return _frame(found) if what in TABLES else found
 
 
-@contextmanager
-def _named(path):
-    try:
-        yield
-    except (ValueError, KeyError, TypeError, IndexError, OSError, EOFError,
-            AttributeError, NotImplementedError, zipfile.BadZipFile,
-            zipfile.zlib.error) as error:
-        warnings.warn(f"{path} is skipped: it is damaged, or no record of this study "
-                      f"({type(error).__name__}: {error})", stacklevel=4)
+RUN = ("task", "algorithm", "variant", "seed")
 
 
-def _order(task, variant, algorithm, seed):
-    place = lambda all_, one: all_.index(one) if one in all_ else len(all_)  # noqa: E731
-    return (place(TASKS, task), task, variant != "class", variant,
-            place(list(ALGORITHMS), algorithm), algorithm, seed)
+def _order(task, algorithm, variant, seed):
+    tasks, algorithms = [*TASKS, task], [*ALGORITHMS, algorithm]
+    return (tasks.index(task), task, variant != "class", variant,
+            algorithms.index(algorithm), algorithm, seed)
 
 
-def read_meta(content):
-    """The dict that a record begins with: config, versions, processor, ..."""
-    meta = json.loads(str(content["meta"]))
-    if meta["format"] != FORMAT:
-        raise ValueError(f"format {meta['format']!r}, expected {FORMAT}")
-    return meta
-
-
-def _read(path, what):
+def _read(path, what, rule):
     """What one record holds of `what`: a list of one dict, or of none."""
     with open(path, "rb") as file, np.load(file, allow_pickle=False) as content:
-        meta = read_meta(content)
+        meta = json.loads(str(content["meta"]))
+        if meta["format"] != FORMAT:
+            raise ValueError(f"format {meta['format']!r}, expected {FORMAT}")
         config = meta["config"]
         one = dict(task=config["task"], algorithm=config["algorithm"],
                    variant=meta["variant"], seed=config["seed"])
         if what in TABLES:
-            table = content[what].astype(np.float64)
-            names = meta[f"{what}_numbers"]
-            numbers = dict(zip(names, table.T, strict=True)) if len(table) else {}
-            labels = meta[f"{what}_labels"]
-            if labels:
-                one |= dict(zip(labels, content[f"{what}_labels"].T, strict=True))
-            one |= numbers
-            if not numbers:
+            names, labels = meta[f"{what}_numbers"], meta[f"{what}_labels"]
+            if not names:
                 return []
+            table = content[what].astype(np.float64)
+            rows = slice(None)
+            if labels:
+                words = content[f"{what}_labels"]
+                rows = words[:, labels.index("rule")] == (rule or config["act_rule"])
+                one |= dict(zip(labels, words[rows].T, strict=True))
+            one |= dict(zip(names, table[rows].T, strict=True))
         elif what == "episodes":
             step, length, total = content["episodes"].T
             one |= dict(step=step.astype(int), length=length.astype(int),
                         episode_return=total)
+        elif what == "meta":
+            one |= meta | dict(first_losses=content["first_losses"])
         elif what == "visits" and "visits" in content:
-            (x, y) = PLANES[one["task"]][1]
+            x, y = PLANES[one["task"]][1]
             one |= dict(counts=content["visits"], x=np.linspace(*x, BINS + 1),
                         y=np.linspace(*y, BINS + 1))
         elif what == "planes" and "picture_q" in content:
@@ -711,20 +741,31 @@ def _read(path, what):
 
 
 def _frame(found):
-    """One DataFrame of all runs' rows."""
+    """One DataFrame of all runs' rows. A column that a run lacks is NaN there."""
     import pandas as pd
 
-    names = dict.fromkeys(("task", "algorithm", "variant", "seed", "step", "updates"))
-    for one in found:
-        names |= dict.fromkeys(one)
-    lengths = [len(one["step"]) for one in found]
+    whole = ("seed", "step", "updates", "n")
     columns = {}
-    for name in names:
-        parts = [np.broadcast_to(one.get(name, np.nan), n)
-                 for one, n in zip(found, lengths, strict=True)]
+    names = [*RUN, "step", "updates", *(name for one in found for name in one)]
+    for name in dict.fromkeys(names):
+        parts = [np.broadcast_to(one.get(name, np.nan), len(one["step"]))
+                 for one in found]
         column = np.concatenate(parts) if parts else np.empty(0)
-        columns[name] = column.astype(int) if name in WHOLE[:4] else column
+        columns[name] = column.astype(int) if name in whole else column
     return pd.DataFrame(columns)
+
+
+def score(table, column="mean"):
+    """A run's score, declared beforehand: the mean of its last ten evaluations.
+
+    On MuJoCo of its last five; never the maximum over time. `table` holds a task's
+    evaluations, or rows of bias that were chosen to be one per evaluation. Returns a
+    Series over (task, algorithm, variant, seed).
+    """
+    def last(runs):
+        return runs.tail(5 if runs.name[0] in MUJOCO_TASKS else 10).mean()
+
+    return table.sort_values("step").groupby([*RUN], sort=False)[column].apply(last)
 
 
 def load_agent_at(weights, i=-1):
@@ -740,7 +781,118 @@ def load_agent_at(weights, i=-1):
     return agent
 
 
-# --- 6. The command -------------------------------------------------------------------
+def film(task, algorithm="DN-DDPG", variant="class", seed=0, folder=None):
+    """Film one episode of a recorded agent, from the start with seed 0, without noise.
+
+    Writes films/<task>-<variant>-<algorithm>.gif, and a strip of ten pictures as .png,
+    into the folder of the recordings. Returns both paths. ValueError where no weights
+    are recorded, or no picture can be made.
+    """
+    from PIL import Image
+
+    from dnddpg_minimal.__main__ import make_camera_env, play, write_film
+
+    folder = Path(folder or RECORDINGS)
+    weights = [one for one in load_study(task, algorithm, variant, "weights", folder)
+               if one["seed"] == seed]
+    if not weights:
+        name = f"{task}/{variant}/{algorithm}-{seed}"
+        raise ValueError(f"{folder} holds no weights of {name}")
+    agent = load_agent_at(weights[0])
+    env = make_camera_env(agent.config)
+    length = len(list(play(agent, env, seed=0)))
+    every = -(-length // 200)  # at most 200 pictures
+    images = [env.render() for step, _ in enumerate(play(agent, env, seed=0))
+              if step % every == 0]
+    seconds = every / env.metadata.get("render_fps", 30)
+    env.close()
+    path = folder / "films" / f"{task}-{variant}-{algorithm}.gif"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_film(path, images, seconds)
+    chosen = [Image.fromarray(images[i]).resize((150, 150), Image.Resampling.LANCZOS)
+              for i in np.linspace(0, len(images) - 1, 10).astype(int)]
+    strip = Image.new("RGB", (150 * len(chosen), 150))
+    for i, image in enumerate(chosen):
+        strip.paste(image, (150 * i, 0))
+    strip.quantize(64).save(path.with_suffix(".png"), optimize=True)
+    return path, path.with_suffix(".png")
+
+
+# --- 6. The table as measured ---------------------------------------------------------
+
+
+def results(variant="class", folder=None):
+    """Return and bias of every task and algorithm: mean, standard error, n of runs.
+
+    Each run counts by its `score`. The bias is the first critic's, at the policy's
+    action: over start states, on MuJoCo over on-policy states. A DataFrame over (task,
+    variant, algorithm); "return", "bias" and "owed" hold (mean, error, n).
+    """
+    import pandas as pd
+
+    returns = score(load_study(variant=variant, folder=folder))
+    rows = load_study(variant=variant, what="bias", folder=folder)
+    rows = rows[(rows.action == "policy") & (rows.critic == "0")
+                & rows.states.isin(("start", "on_policy"))]
+    runs = pd.DataFrame({"return": returns, "bias": score(rows, "bias"),
+                         "owed": score(rows, "owed")})
+    return runs, runs.groupby(["task", "variant", "algorithm"], sort=False).agg(
+        bias.summary)
+
+
+def claims(runs):
+    """What the paper says, against the runs of `results`: one row per task and claim.
+
+    Differences are paired by seed; a verdict needs a 95 % t-interval on one side of 0.
+    """
+    from scipy.stats import t
+
+    def of(name, algorithm):
+        return runs[name].xs(algorithm, level="algorithm").droplevel("variant")
+
+    dn, dcn, ddpg = "DN-DDPG", "DCN-DDPG", "DDPG"
+    said = {"return: DN > DDPG": of("return", dn) - of("return", ddpg),
+            "return: DN > DCN": of("return", dn) - of("return", dcn),
+            "bias: DDPG > 0": of("bias", ddpg),
+            "bias: DCN < 0": -of("bias", dcn),
+            "bias: DN > DCN": of("bias", dn) - of("bias", dcn)}
+    found = []
+    for claim, values in said.items():
+        for task, group in values.dropna().groupby(level="task", sort=False):
+            mean, error, n = bias.summary(group)
+            width = t.ppf(0.975, n - 1) * error if n > 1 else np.inf
+            verdict = ("not distinguishable" if not abs(mean) > width else
+                       "holds" if mean > 0 else "does not hold")
+            found.append(dict(task=task, claim=claim, mean=mean, error=error, n=n,
+                              verdict=verdict))
+    return found
+
+
+def write_readme(folder=None):
+    """Put the tables as measured into recordings/README.md, between its two marks."""
+    path = Path(folder or RECORDINGS) / "README.md"
+    begin, end = "<!-- measured -->\n", "<!-- end -->"
+    runs, table = results(None, folder)
+    text = [f"{len(runs)} runs. Each number: mean ± standard error (number of runs).\n"]
+    row = "| {} |".format
+    heads = ["task", "variant", "algorithm", "return", "bias of Q", "owed to lag"]
+    text += [row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
+    for names, values in table.iterrows():
+        cells = ["{:.4g} ± {:.2g} ({})".format(*value) if value[2] > 1 else
+                 "{:.4g} (1)".format(*value) for value in values]
+        text.append(row(" | ".join([*names, *cells])))
+    heads = ["claim", "task", "difference", "verdict"]
+    text += ["", row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
+    for one in claims(runs.xs("class", level="variant", drop_level=False)):
+        text.append("| {claim} | {task} | {mean:.3g} ± {error:.2g} ({n}) | {verdict} |"
+                    .format(**one))
+    before, _, after = path.read_text(encoding="utf-8").partition(begin)
+    after = after.partition(end)[2]
+    path.write_text(before + begin + "\n".join(text) + "\n" + end + after,
+                    encoding="utf-8", newline="\n")
+
+
+# --- 7. The command -------------------------------------------------------------------
 
 
 def main(argv=None):
@@ -763,6 +915,8 @@ def command(
     scheduler: str | None = None,
     dry_run: bool = False,
     status: bool = False,
+    readme: bool = False,
+    films: bool = False,
 ) -> int:
     """Do the runs of a budget that are missing. Ctrl-C stops; the same command goes on.
 
@@ -772,55 +926,84 @@ def command(
         algorithm: only these algorithms.
         variant: only these variants.
         seeds: only these seeds.
-        workers: processes, one run each.
+        workers: processes, each with one run at a time.
         nice: how much the workers stand back for other processes (not on Windows).
         folder: where records are written.
         scratch: where checkpoints are written; None: the user's cache folder.
         scheduler: address of a Dask scheduler, tcp://...; its workers do the runs.
-        dry_run: only say what would be done, and how long it takes on this machine.
-        status: only say what is there and how far the unfinished runs are.
+        dry_run: only say what is missing, and how long it takes on this machine.
+        status: only say what is recorded, and how far the unfinished runs are.
+        readme: only write the tables as measured into the folder's README.md.
+        films: only film the recorded agents that the book shows.
     """
-    from tqdm import tqdm
-
+    if workers < 1:
+        raise ValueError(f"workers={workers}: expected 1 or more.")
+    if readme:
+        write_readme(folder)
+        return 0
+    if films:
+        for name in FILMED:
+            task_, variant_, file = name.split("/")
+            print(*film(task_, file[:-2], variant_, 0, folder))
+        return 0
     runs = [run for run in list_of(budget)
             if (not task or run.config.task in task)
             and (not algorithm or run.config.algorithm in algorithm)
             and (not variant or run.variant in variant)
             and (not seeds or run.config.seed in seeds)]
+    if not runs:
+        variants = ", ".join(dict.fromkeys(run.variant for run in list_of(budget)))
+        raise ValueError(f"no such run in {budget!r}. Its variants: {variants}. Its "
+                         f"tasks: {', '.join(TASKS)}.")
     missing = [run for run in runs if not (folder / f"{run.name}.npz").exists()]
     print(f"{len(runs)} runs, {len(runs) - len(missing)} recorded, "
           f"{len(missing)} to do.", flush=True)
-    size = {run.name: work(run.config) for run in missing}
-    began, over = time.monotonic(), set()
-    with tqdm(total=sum(size.values()), disable=None, unit_scale=True,
-              bar_format="{percentage:5.1f} % |{bar}| {remaining} left {desc}") as bar:
-
-        def report(done, running):
-            over.update(done)
-            part = {c.run.name: c.progress() for c in running}
-            bar.n = sum(size[name] * part.get(name, name in over) for name in size)
-            bar.set_description_str("  ".join(f"{name} {100 * share:.0f} %" for
-                                              name, share in part.items()), False)
-            bar.refresh()
-            for name in done if bar.disable else ():
-                minutes = (time.monotonic() - began) / 60
-                print(f"{minutes:7.1f} min  {len(over)}/{len(missing)}  {name}",
-                      flush=True)
-
-        try:
+    if dry_run or status:
+        return tell(runs, missing, folder, scratch, timed=dry_run, workers=workers)
+    try:
+        with Progress(missing) as progress:
             failed = study(missing, folder, scratch, workers, nice, scheduler,
-                           report=report)
-        except KeyboardInterrupt:
-            bar.close()
-            print("Stopped. Nothing recorded is lost: the same command goes on.")
-            return 130
+                           report=progress)
+    except KeyboardInterrupt:
+        print("Stopped. Nothing recorded is lost: the same command goes on.")
+        return 130
     for name, why in failed.items():
         print(f"failed: {name}: {why}", file=sys.stderr)
     print(f"{len(missing) - len(failed)} runs done, {len(failed)} failed.")
     return 1 if failed else 0
 
 
-def work(config):
+class Progress:
+    """One bar for the whole study, and what each worker does. Lines in a file."""
+
+    def __init__(self, runs):
+        from tqdm import tqdm
+
+        self.size = {run.name: rough_work(run.config) for run in runs}
+        self.over, self.began = set(), time.monotonic()
+        form = "{percentage:5.1f} % |{bar}| {remaining} left  {desc}"
+        self.bar = tqdm(total=sum(self.size.values()), disable=None, bar_format=form)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.bar.close()
+
+    def __call__(self, done, running):
+        self.over.update(done)
+        part = {one.run.name: one.progress() for one in running}
+        self.bar.n = sum(size * part.get(name, name in self.over)
+                         for name, size in self.size.items())
+        self.bar.set_description_str("  ".join(
+            f"{name} {100 * share:.0f} %" for name, share in part.items() if share))
+        for name in done if self.bar.disable else ():
+            minutes = (time.monotonic() - self.began) / 60
+            print(f"{minutes:8.1f} min  {len(self.over)} of {len(self.size)}  {name}",
+                  flush=True)
+
+
+def rough_work(config):
     """A rough measure of a run's work, to weigh the runs in one progress bar."""
     steps = config.steps or config.episodes * (config.max_episode_steps or 1_000)
     weights = sum(a * b for a, b in itertools.pairwise((*config.hidden, 1)))
@@ -828,7 +1011,56 @@ def work(config):
     return steps * (1e-4 + config.updates_per_step * (2e-4 + products / 1e10))
 
 
-if __name__ == "__main__":
-    from dnddpg_minimal.study import main as _main  # workers look for it by this name
+def tell(runs, missing, folder, scratch, timed, workers):
+    """Print what is there and what is missing, by task and variant; `timed`: hours."""
+    groups, total = {}, 0.0
+    for run in runs:
+        groups.setdefault((run.config.task, run.variant), []).append(run)
+    for (task, variant), group in groups.items():
+        todo = [run for run in group if run in missing]
+        line = f"{task:26}{variant:34}{len(group) - len(todo):4} of {len(group):3}"
+        if timed:
+            hours = sum(seconds_of(run.config) for run in todo) / 3600
+            line, total = f"{line}{hours:9.2f} core-hours to do", total + hours
+        print(line, flush=True)
+    for run in missing:
+        part = Checkpoint(run, folder, scratch).progress()
+        if part > 0:
+            print(f"unfinished: {run.name} {100 * part:.0f} %")
+    if timed:
+        print(f"{total:.1f} core-hours, {total / workers:.1f} hours with {workers} "
+              "workers, if each has a core of its own.")
+    return 0
 
-    sys.exit(_main())
+
+def seconds_of(config):
+    """Seconds that a run will take here, from a short one of the same sizes.
+
+    An upper bound where episodes end early (Hopper, Walker2d, Humanoid).
+    """
+    steps, limit = config.steps, config.max_episode_steps or 1_000
+    if steps is None:
+        steps = config.episodes * limit
+    learning, measuring, in_full = probe(
+        config.task, config.algorithm, config.hidden, config.batch_size,
+        config.updates_per_step)
+    return steps * learning + steps / config.evaluate_every * measuring + in_full
+
+
+@cache
+def probe(task, algorithm, hidden, batch_size, updates_per_step):
+    """Seconds of one step with its updates, of one evaluation, of all the full ones."""
+    config = Config(task, algorithm, hidden=hidden, batch_size=batch_size, steps=300,
+                    updates_per_step=updates_per_step, warmup=150, yield_every=50)
+    clock = {}  # step: seconds of processor time
+    for item in (training := Training(config)):
+        clock.setdefault(item.step, time.process_time())
+    walking, learning = ((clock[step + 100] - clock[step]) / 100 for step in (50, 200))
+    if task in MUJOCO_TASKS:  # as if every episode lasted to its time limit
+        acting = walking + 5e-5  # and the policy's own time
+        return learning, 5 * 1_000 * acting, 4 * 64 * 2 * 500 * acting
+    begun = time.process_time()
+    bias.evaluate(training, full=False)
+    between = time.process_time()
+    bias.evaluate(training, full=True)
+    return learning, between - begun, 10 * (time.process_time() - between)

@@ -1,7 +1,7 @@
-"""DDPG in sixty plain lines: one critic, one actor, no leading axis (an oracle).
+"""DDPG in sixty plain lines, and a loop that trains it: an oracle for the package.
 
-As short as it can be, and with none of the package's machinery but the random streams
-and Adam (which has a test of its own). Lillicrap et al. 2015, Algorithm 1. A layer's
+One critic, one actor, no leading axis, and none of the package's machinery but the
+random streams and Adam (which has a test of its own). Lillicrap et al. 2015, Algorithm 1. A layer's
 bias is the last row of its weights. Works where a time limit is the only end.
 """
 

@@ -1,0 +1,507 @@
+"""The book's figures: one function per figure.
+
+Each takes what was measured, draws it, and returns the axes. None of them trains. Pass
+`ax` (or `axes`) to draw into a figure of your own. Titles state the finding, so the
+caller, who knows it, passes them.
+
+| call | shows |
+|---|---|
+| `plot_memory(memory, batches)` | batches of states over all the states in memory |
+| `plot_q(curves, truth)` | Q during training, and what it should become |
+| `plot_bias(curves, predicted)` | Q minus truth during training, and its prediction |
+| `plot_learning(records, evaluations)` | returns of the episodes and of evaluations |
+| `plot_filmstrip(pictures)` | a rollout in ten pictures |
+| `plot_truth(picture, path)` | the true Q over two state variables, and one path |
+| `plot_error_plane(picture)` | truth, a critic, and its error, side by side |
+
+The same algorithm has the same colour and the same kind of line everywhere. What is
+true is black. The colours (Okabe and Ito, 2008) are told apart by colour-blind readers.
+
+    python -m dnddpg_minimal.plots notebooks/03_ddpg.ipynb
+
+writes a chapter's last figure to `notebooks/figures/03_ddpg.png`, which the chapter
+shows at its top.
+"""
+
+import base64
+import json
+import sys
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+STYLE = {  # of the lines of each algorithm
+    "DDPG": dict(color="#D55E00", linestyle="-"),
+    "DCN-DDPG": dict(color="#0072B2", linestyle="--"),
+    "DN-DDPG": dict(color="#009E73", linestyle="-."),
+}
+TRUTH = dict(color="black", linestyle="-", linewidth=1.2)
+WRONG = dict(color="#CC79A7", linestyle=":", linewidth=2.4)  # a fault, on purpose
+VALUES, ERRORS = "cividis", "RdBu_r"  # maps of values, and of errors around 0
+SIGN = "overestimates ↑ / underestimates ↓"
+GREY = "0.6"
+
+plt.rcParams.update({
+    "figure.dpi": 100,
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+})
+
+
+def plot_memory(memory, batches, axes=None):
+    """Batches of states, each over the same memory. One panel per batch.
+
+    memory (N, 2): angle in radians and velocity in radians per second; batches: a
+    dict from a panel's title to rows (B,) of memory.
+    """
+    if axes is None:
+        _, axes = plt.subplots(1, len(batches), figsize=(6.6, 2.7), sharey=True,
+                               layout="constrained")
+    for ax, (title, rows) in zip(axes, batches.items(), strict=True):
+        ax.plot(*memory.T, "s", color="0.8", markersize=1.6, markeredgewidth=0)
+        ax.plot(*memory[rows].T, "o", color=STYLE["DDPG"]["color"], markersize=4,
+                markeredgewidth=0)
+        ax.set(title=title, xlabel="angle (0 is upright)")
+        _angle_ticks(ax)
+    axes[0].set_ylabel("velocity")
+    return axes
+
+
+def plot_q(curves, truth, ax=None, title=""):
+    """Q during training: a line for each run, a black line for the truth.
+
+    curves: a dict from a label to (updates (M,), q (M,)); truth: one number.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.4, 3), layout="constrained")
+    ax.axhline(truth, **TRUTH)
+    _note(ax, truth, "truth")
+    _lines(ax, curves)
+    ax.set(title=title, xlabel="updates", ylabel="Q")
+    return ax
+
+
+def plot_bias(curves, predicted=None, ax=None, title=""):
+    """Q − truth during training: a line for each run, a black line at zero.
+
+    curves: a dict from a label to (updates (M,), bias (M,)); predicted: a dict from a
+    label to one bias, drawn as a thin grey line.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.4, 3.2), layout="constrained")
+    ax.axhline(0, **TRUTH)
+    _note(ax, 0, SIGN)
+    for label, level in (predicted or {}).items():
+        ax.axhline(level, color=GREY, linewidth=1)
+        _note(ax, level, label, above=False)
+    _lines(ax, curves)
+    ax.set(title=title, xlabel="updates", ylabel="bias = Q − truth")
+    return ax
+
+
+def style_of(label):
+    """The line of a run whose label begins with an algorithm's name."""
+    fault = " with " in label  # "DDPG with the wrong line": a fault, made on purpose
+    return WRONG if fault else STYLE.get(label.split(",")[0], WRONG)
+
+
+def _lines(ax, curves):
+    for label, (updates, values) in curves.items():
+        ax.plot(updates, values, label=label, **{"linewidth": 1.8} | style_of(label))
+    _legend_below(ax)
+
+
+def _legend_below(ax):
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=3)
+
+
+def _note(ax, level, text, above=True):
+    """Write above or below a horizontal line, at its right end."""
+    ax.annotate(text, (0.995, level), xycoords=("axes fraction", "data"), ha="right",
+                xytext=(0, 5 if above else -5), textcoords="offset points",
+                va="bottom" if above else "top", fontsize=8.5)
+
+
+def _thousands(ax):
+    ax.xaxis.set_major_formatter(lambda x, _: f"{x:,.0f}".replace(",", " "))
+
+
+def plot_learning(records, evaluations, random=None, ax=None, title=""):
+    """Returns during training: each episode as a dot, evaluations as a line.
+
+    records: `Record`s of kind "episode", played with noise. evaluations: the dicts
+    `Measurement.evaluation`; the bar is two standard errors over their n starts.
+    random: the return of random actions.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.4, 3.1), layout="constrained")
+    name = evaluations[0]["algorithm"]
+    ax.plot([r.step for r in records], [r.episode_return for r in records], "o",
+            color=GREY, markersize=3, label="an episode of training, with noise")
+    columns = ("step", "mean", "standard_error")
+    step, mean, error = np.array([[e[c] for c in columns] for e in evaluations]).T
+    ax.errorbar(step, mean, 2 * error, linewidth=1.8, marker="o", markersize=4,
+                label=f"{name}, evaluated without noise, mean of "
+                      f"{evaluations[0]['n']} starts", **STYLE.get(name, {}))
+    if random is not None:
+        ax.axhline(random, color=GREY, linestyle=":")
+        _note(ax, random, "random actions")
+    ax.set(title=title, xlabel="environment steps", ylabel="return of an episode")
+    _thousands(ax)
+    _legend_below(ax)
+    return ax
+
+
+def plot_filmstrip(pictures, ax=None, title="", count=10, dt=0.05):
+    """A rollout as `count` pictures side by side, the time written under each.
+
+    pictures: arrays (height, width, 3) uint8, one per step of `dt` seconds.
+    """
+    chosen = np.linspace(0, len(pictures) - 1, count).round().astype(int)
+    height, width = pictures[0].shape[:2]
+    if ax is None:
+        _, ax = plt.subplots(figsize=(8, 8 * height / width / count + 0.5),
+                             layout="constrained")
+    coarse = max(1, round(width / 80))  # pixels per pixel: a strip is small
+    small = [_shrink(pictures[i], coarse) for i in chosen]
+    ax.imshow(np.concatenate(small, axis=1), interpolation="nearest")
+    w = small[0].shape[1]
+    for n in range(1, count):
+        ax.axvline(n * w - 0.5, color="0.85", linewidth=1)
+    ax.set_xticks([(n + 0.5) * w for n in range(count)],
+                  [f"{i * dt:.1f} s" for i in chosen])
+    ax.set(yticks=[], title=title)
+    ax.spines[:].set_visible(False)
+    ax.tick_params(length=0)
+    return ax
+
+
+def _shrink(picture, factor):
+    """Mean over squares of factor × factor pixels."""
+    height, width = (side // factor * factor for side in picture.shape[:2])
+    squares = picture[:height, :width].reshape(height // factor, factor,
+                                               width // factor, factor, -1)
+    return squares.mean(axis=(1, 3)).astype(np.uint8)
+
+
+def plot_truth(picture, path=None, ax=None, title=""):
+    """The true Q over the state plane, and the path of one rollout.
+
+    picture: what `bias.plane` returns; path (T, 2): the two state variables, from the
+    ring to the star. An angle that passes ±π leaves on one side, returns on the other.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(5.2, 3.3), layout="constrained")
+    image = _map(ax, picture, picture["truth"], VALUES)
+    ax.figure.colorbar(image, ax=ax, label="true Q (discounted return)")
+    if path is not None:
+        path = np.array(path)
+        if _is_angle(picture["x"]):
+            path[:, 0] = (path[:, 0] + np.pi) % (2 * np.pi) - np.pi
+        jumps = np.abs(np.diff(path[:, 0])) > np.ptp(picture["x"]) / 2
+        broken = np.insert(path, np.flatnonzero(jumps) + 1, np.nan, axis=0)
+        ax.plot(*broken.T, color="white", linewidth=3)
+        ax.plot(*broken.T, color="black", linewidth=1.2)
+        marks = dict(markeredgecolor="black", markerfacecolor="white", zorder=3)
+        ax.plot(*path[0], "o", markersize=8, **marks)
+        ax.plot(*path[-1], "*", markersize=14, **marks)
+    ax.set(title=title, ylabel="velocity")
+    return ax
+
+
+def plot_error_plane(picture, critic=0, axes=None, title="", limit=None):
+    """Truth, critic and error over the state plane, side by side.
+
+    picture: what `bias.plane` returns. The first two panels share one scale. In the
+    third, red is where the critic overestimates, blue where it underestimates; colours
+    end at ±`limit`, by default the 99th percentile of the error's size.
+    """
+    if axes is None:
+        figure, axes = plt.subplots(1, 3, figsize=(7.6, 2.7), sharey=True,
+                                    layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    q, truth = picture["q"][critic], picture["truth"]
+    error = q - truth
+    limit = np.quantile(np.abs(error), 0.99) if limit is None else limit
+    low, high = min(q.min(), truth.min()), max(q.max(), truth.max())
+    _map(axes[0], picture, truth, VALUES, low, high)
+    image = _map(axes[1], picture, q, VALUES, low, high)
+    axes[0].figure.colorbar(image, ax=axes[:2])
+    image = _map(axes[2], picture, error, ERRORS, -limit, limit)
+    bar = axes[0].figure.colorbar(image, ax=axes[2], extend="both")
+    # Turned by 90 degrees, the arrows point down and up.
+    bar.set_label("← underestimates    overestimates →", fontsize=8)
+    for ax, name in zip(axes, ("the truth", "what the critic says", "Q − truth"),
+                        strict=True):
+        ax.set_title(name, loc="center", fontsize=9)
+    axes[0].set_ylabel("velocity")
+    return axes
+
+
+def _map(ax, picture, values, colours, low=None, high=None):
+    """One map over the state plane; its axes are [y, x]."""
+    x, y = picture["x"], picture["y"]
+    colours = plt.get_cmap(colours, 25)  # few colours: a small file
+    image = ax.imshow(values, origin="lower", aspect="auto", cmap=colours, vmin=low,
+                      vmax=high, extent=(x[0], x[-1], y[0], y[-1]),
+                      interpolation="nearest")
+    ax.spines[:].set_visible(False)
+    ax.set_xlabel("angle (0 is upright)")
+    if _is_angle(x):
+        _angle_ticks(ax)
+    return image
+
+
+def _is_angle(x):
+    return np.allclose((x[0], x[-1]), (-np.pi, np.pi))
+
+
+def _angle_ticks(ax):
+    ax.set_xticks([-np.pi, -np.pi / 2, 0, np.pi / 2, np.pi],
+                  ["−π", "−π/2", "0", "π/2", "π"])
+
+
+# --- chapters 01, 02 ------------------------------------------------------------------
+
+ONE = dict(color="#E69F00", linestyle="-", linewidth=2)  # lines of no algorithm
+TWO = dict(color="#56B4E9", linestyle="--", linewidth=2)
+THREE = dict(color="#CC79A7", linestyle=":", linewidth=2.4)
+
+
+def plot_partial_sums(sums, totals, ax=None, title=""):
+    """The discounted rewards, added up step by step, until nothing more comes.
+
+    sums: a dict from a label to (T,); totals: the same labels to the whole return.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.4, 2.9), layout="constrained")
+    for (label, values), style in zip(sums.items(), (ONE, TWO, THREE)):
+        ax.axhline(totals[label], **TRUTH)
+        ax.plot(np.arange(1, len(values) + 1), values, marker="o", markersize=3,
+                label=label, **style)
+    ax.set(title=title, xlabel="rewards added up", ylabel="sum of γᵗ · reward")
+    ax.legend()
+    return ax
+
+
+def plot_true_q(position, action, q, lines, axes=None, title=""):
+    """The true Q over position and action: as a surface, and as a map from above.
+
+    position (X,), action (Y,), q (Y, X); lines: a dict from a label to actions (X,).
+    """
+    if axes is None:
+        figure = plt.figure(figsize=(8, 3.2), layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+        axes = figure.add_subplot(1, 2, 1, projection="3d"), figure.add_subplot(1, 2, 2)
+    surface, flat = axes
+    surface.plot_surface(*np.meshgrid(position, action), q, cmap=VALUES, rcount=20,
+                         ccount=20, linewidth=0, antialiased=False)
+    surface.set(xlabel="position", ylabel="action", zlabel="true Q")
+    surface.view_init(elev=32, azim=-62)
+    levels = flat.contourf(position, action, q, 14, cmap=VALUES)
+    flat.figure.colorbar(levels, ax=flat, label="true Q (discounted return)")
+    for (label, actions), style in zip(lines.items(), ("-", "--")):
+        flat.plot(position, actions, color="white", linewidth=3.5)
+        flat.plot(position, actions, color="black", linestyle=style, label=label)
+    flat.set(xlabel="position", ylabel="action")
+    flat.legend(loc="lower left", frameon=True, framealpha=0.9)
+    return axes
+
+
+def plot_differences(h, errors, ax=None, title=""):
+    """The error of finite differences against the step h, both on log axes.
+
+    h (N,); errors: a dict from a label to (N,), absolute errors of the slope.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.4, 3), layout="constrained")
+    for (label, values), style in zip(errors.items(), (ONE, TWO, THREE)):
+        ax.loglog(h, np.maximum(values, 1e-16), marker="o", markersize=3, label=label,
+                  **style)
+    ax.set(title=title, xlabel="step h", ylabel="error of the slope")
+    ax.legend(loc="lower left")
+    return ax
+
+
+def plot_slices(action, truth, guesses, tops=False, ax=None, title=""):
+    """Q along the action at one state: the truth in black, and some critics.
+
+    action (N,), truth (N,); guesses: a dict from a label to (N,). `tops` marks the
+    highest point of every line.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.4, 3.1), layout="constrained")
+    for (label, values), style in zip(guesses.items(), (ONE, TWO, THREE)):
+        ax.plot(action, values, label=label, **style)
+    ax.plot(action, truth, label="the truth", **TRUTH | {"linewidth": 1.8})
+    if tops:
+        for line in ax.lines[:]:
+            top = np.argmax(line.get_ydata())
+            x, y = action[top], line.get_ydata()[top]
+            ax.plot(x, y, "o", markersize=7, zorder=4, color=line.get_color())
+            ax.axvline(x, color=line.get_color(), linestyle=":", linewidth=1)
+    ax.set(title=title, xlabel="action", ylabel="Q")
+    ax.legend()
+    return ax
+
+
+def plot_decay(errors, share=0.01, ax=None, title=""):
+    """What is left of an error after n backups, as a share of its first size.
+
+    errors: a dict from a label to (N,), starting with 1. A thin line marks `share`.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.4, 3), layout="constrained")
+    for (label, values), style in zip(errors.items(), (ONE, TWO, THREE)):
+        ax.semilogy(values, label=label, **style)
+    ax.axhline(share, color=GREY, linewidth=1)
+    ax.annotate(f"{share:.0%} is left", (0.99, share), ha="right", va="bottom",
+                xycoords=("axes fraction", "data"), color="0.4")
+    ax.set(title=title, xlabel="backups", ylabel="share of the error",
+           ylim=(share / 5, 1.2))
+    ax.legend(loc="upper right", bbox_to_anchor=(1, 0.9))
+    return ax
+
+
+def plot_learned_q(position, action, errors, curves, rms, axes=None, title=""):
+    """Above: maps of Q − truth at some moments. Below: its mean over all that time.
+
+    errors: a dict from an update to the error (Y, X) over action and position. curves:
+    a list of (updates (M,), mean error (M,)), one for each first network; rms (M,):
+    the root mean square of the first one's error.
+    """
+    if axes is None:
+        figure = plt.figure(figsize=(8, 5), layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+        grid = figure.add_gridspec(2, len(errors))
+        axes = [figure.add_subplot(grid[0, n]) for n in range(len(errors))]
+        axes += [figure.add_subplot(grid[1, :])]
+    limit = max(np.abs(error).max() for error in errors.values())
+    for ax, (update, error) in zip(axes, errors.items()):
+        image = ax.imshow(error, origin="lower", aspect="auto", vmin=-limit, vmax=limit,
+                          cmap=plt.get_cmap(ERRORS, 33), interpolation="nearest",
+                          extent=(position[0], position[-1], action[0], action[-1]))
+        ax.set_title(f"after {update:,} updates", loc="center", fontsize=9)
+        ax.set(xlabel="position", ylabel="action" if ax is axes[0] else "")
+    bar = axes[0].figure.colorbar(image, ax=axes[:-1])
+    bar.set_label("← under    over →", fontsize=8)
+    below = axes[-1]
+    for n, (updates, mean) in enumerate(curves):
+        style = dict(color=ONE["color"], linewidth=1.8 if n == 0 else 0.7)
+        label = {0: "mean error", 1: "mean error, other first networks"}.get(n)
+        below.plot(updates, mean, label=label, **style)
+    below.plot(curves[0][0], rms, label="root mean square error", **TWO)
+    below.axhline(0, color="black", linewidth=0.8)
+    for update in errors:
+        below.axvline(update, color=GREY, linewidth=0.8, linestyle=":")
+    below.set(xlabel="updates", ylabel=f"Q − truth\n{SIGN}")
+    below.yaxis.label.set_size(8)
+    below.legend(loc="upper right")
+    return axes
+
+
+def plot_hill(first, second, height, paths, top, ax=None, title=""):
+    """The objective J over two parameters of a policy, and paths that climb it.
+
+    first (X,), second (Y,), height (Y, X); paths: a dict from a label to (T, 2), each
+    from its ring to the star `top` (2,).
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.2, 3.6), layout="constrained")
+    levels = height.max() - np.ptp(height) * np.linspace(0, 1, 25)[::-1] ** 2
+    image = ax.contourf(first, second, height, levels, cmap=VALUES)
+    ax.figure.colorbar(image, ax=ax, label="J (mean discounted return)", format="%.2f")
+    for (label, path), style in zip(paths.items(), (ONE, TWO, THREE)):
+        ax.plot(*np.transpose(path), color="black", linewidth=3.2)
+        ax.plot(*np.transpose(path), label=label, **style)
+        ax.plot(*path[0], "o", markerfacecolor="white", markeredgecolor="black")
+    ax.plot(*top, "*", markersize=15, markerfacecolor="white", markeredgecolor="black")
+    ax.set(title=title, xlabel="gain of the position", ylabel="gain of the velocity")
+    if paths:
+        ax.legend(loc="upper left", frameon=True, framealpha=0.9)
+    return ax
+
+
+def plot_slope_ways(gain, slope, ways, ax=None, title=""):
+    """The slope of J against one gain, and the same slope found in other ways.
+
+    gain (N,), slope (N,) the exact slope; ways: a dict from a label to (gains, slopes).
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.4, 3), layout="constrained")
+    ax.axhline(0, color=GREY, linewidth=0.8)
+    ax.plot(gain, slope, label="closed form", **TRUTH)
+    marks = (("o", 10, ONE), ("s", 6.5, TWO), ("x", 5, dict(color="black")))
+    for (label, (gains, slopes)), (marker, size, style) in zip(ways.items(), marks):
+        ax.plot(gains, slopes, marker, markersize=size, markerfacecolor="none",
+                markeredgecolor=style["color"], markeredgewidth=1.6, label=label)
+    ax.set(title=title, xlabel="gain of the position", ylabel="slope of J")
+    ax.legend()
+    return ax
+
+
+def plot_actor(position, best, actors, ax=None, title=""):
+    """An actor's actions against the position, beside the best ones in black.
+
+    position (N,), best (N,); actors: a dict from a label to actions (N,).
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.4, 2.9), layout="constrained")
+    ax.plot(position, best, label="the best action", **TRUTH | {"linewidth": 3})
+    for (label, actions), style in zip(actors.items(), (TWO, THREE, ONE)):
+        ax.plot(position, actions, label=label, **style)
+    ax.set(title=title, xlabel="position (velocity 0)", ylabel="action")
+    ax.legend()
+    return ax
+
+
+def plot_price(slopes, bias, lost, axes=None, title=""):
+    """What a critic's slope m does: its error at the actor's action, and the loss.
+
+    slopes (M,). bias, lost: dicts from a label to values: (M,) are measured, drawn as
+    marks; a pair of arrays (x, y) is a prediction, drawn as a black line.
+    """
+    if axes is None:
+        figure, axes = plt.subplots(1, 2, figsize=(8, 3.1), layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    marks = (("o", ONE), ("s", TWO), ("^", THREE))
+    for ax, series in zip(axes, (bias, lost)):
+        ax.axhline(0, color=GREY, linewidth=0.8)
+        measured = iter(marks)
+        for label, values in series.items():
+            if isinstance(values, tuple):
+                ax.plot(*values, label=label, **TRUTH)
+            else:
+                marker, style = next(measured)
+                ax.plot(slopes, values, marker, color=style["color"], label=label)
+        ax.set_xlabel("slope m of the critic's error along the action")
+        ax.legend()
+    axes[0].set(ylabel=f"critic − truth\n{SIGN}")
+    axes[1].set(ylabel="true value lost")
+    return axes
+
+
+def save_last_figure(notebook):
+    """Write the last figure of an executed notebook beside it, → the file's path."""
+    notebook = Path(notebook)
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    figures = [output["data"]["image/png"] for cell in cells
+               for output in cell.get("outputs", [])
+               if "image/png" in output.get("data", {})]
+    if not figures:
+        raise ValueError(f"{notebook} holds no figure: run it first.")
+    path = notebook.parent / "figures" / f"{notebook.stem}.png"
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(base64.b64decode("".join(figures[-1])))
+    return path
+
+
+if __name__ == "__main__":
+    for argument in sys.argv[1:]:
+        print(save_last_figure(argument))
