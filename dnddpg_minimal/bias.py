@@ -54,8 +54,6 @@ RECENT = 60  # kept states where the dynamics are vectorised (MuJoCo: all 64)
 EPISODES_MUJOCO = 5
 EPISODES_OTHER = 10
 PORTION = 420  # states in one rollout of `true_q`: what the processor's cache holds
-PARTS_EQUATIONS = 10  # so many times in a run everything is measured
-PARTS_MUJOCO = 4
 
 
 # ---------------------------------------------------------------------------
@@ -453,10 +451,10 @@ def evaluate(training, full=None):
     from stream(seed, "evaluation", step).
 
     `full` says whether what is slow is measured, too: on MuJoCo the bias on the kept
-    states; on the other tasks sigma, kappa and rho (else NaN), and with two actors
-    the bias under the other rule (else no rows). None: at the first evaluation at or
-    after 25, 50, 75 and 100 % of `config.steps` on MuJoCo, 10, 20, ... 100 % on the
-    others; never if the run has no `config.steps`.
+    states; where the equations are known sigma, kappa and rho (else NaN), and with two
+    actors the bias under the other rule (else no rows). None: on MuJoCo at the first
+    evaluation at or after 25, 50, 75 and 100 % of `config.steps` (never if the run has
+    none), on the others always.
     """
     config, agent = training.config, training.agent
     common = {"task": config.task, "algorithm": config.algorithm, "seed": config.seed}
@@ -464,20 +462,19 @@ def evaluate(training, full=None):
     rng = stream(config.seed, "evaluation", training.step)
     world = dynamics(config)
     if full is None:
-        parts = PARTS_MUJOCO if world is None else PARTS_EQUATIONS
-        full = _reaches_a_part(config, training.step, parts)
+        full = world is not None or _reaches_a_quarter(config, training.step)
     with threadpool_limits(1):  # one run, one thread
         if world is None:
             return _by_episodes(agent, common, rng, training.kept, full)
         return _by_equations(agent, common, rng, training.kept, full, world)
 
 
-def _reaches_a_part(config, step, parts):
-    """Is this the first evaluation at or after 1/parts, 2/parts, ... of the run?"""
+def _reaches_a_quarter(config, step):
+    """Is this the first evaluation at or after 25, 50, 75 or 100 % of the run?"""
     if config.steps is None:
         return False
     before = max(step - config.evaluate_every, 0)
-    return parts * step // config.steps > parts * before // config.steps
+    return 4 * step // config.steps > 4 * before // config.steps
 
 
 def _by_equations(agent, common, rng, kept, full, world):
@@ -617,7 +614,8 @@ def plane(agent, world, x=0, y=1, fixed=None, size=41):
     x, y = (world.names.index(v) if isinstance(v, str) else v for v in (x, y))
     along_x = np.linspace(world.low[x], world.high[x], size)
     along_y = np.linspace(world.low[y], world.high[y], size)
-    states = np.tile(world.rest if fixed is None else fixed, (size * size, 1))
+    fixed = np.array(world.rest if fixed is None else fixed, np.float64)
+    states = np.tile(fixed, (size * size, 1))
     states[:, x] = np.tile(along_x, size)
     states[:, y] = np.repeat(along_y, size)
     obs = world.observe(states)

@@ -43,7 +43,7 @@ SIGN = "overestimates ↑ / underestimates ↓"
 GREY = "0.6"
 
 plt.rcParams.update({
-    "figure.dpi": 100,
+    "figure.dpi": 90,
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.titlelocation": "left",
@@ -296,21 +296,29 @@ def plot_true_q(position, action, q, lines, axes=None, title=""):
     position (X,), action (Y,), q (Y, X); lines: a dict from a label to actions (X,).
     """
     if axes is None:
-        figure = plt.figure(figsize=(8, 3.2), layout="constrained")
+        figure = plt.figure(figsize=(6.6, 2.6), layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
         axes = figure.add_subplot(1, 2, 1, projection="3d"), figure.add_subplot(1, 2, 2)
-    surface, flat = axes
-    surface.plot_surface(*np.meshgrid(position, action), q, cmap=VALUES, rcount=20,
-                         ccount=20, linewidth=0, antialiased=False)
-    surface.set(xlabel="position", ylabel="action", zlabel="true Q")
-    surface.view_init(elev=32, azim=-62)
-    levels = flat.contourf(position, action, q, 14, cmap=VALUES)
-    flat.figure.colorbar(levels, ax=flat, label="true Q (discounted return)")
+    hill, flat = axes
+    hill.plot_surface(*np.meshgrid(position, action), q, edgecolor="white",
+                      cmap=plt.get_cmap(VALUES, 12), rcount=9, ccount=9, linewidth=0.4)
+    hill.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1])
+    hill.tick_params(pad=-3)
+    hill.grid(False)
+    for axis, name in zip((hill.xaxis, hill.yaxis, hill.zaxis),
+                          ("position", "action", "true Q")):
+        axis.set_label_text(name)
+        axis.labelpad = -6
+        axis.pane.set_visible(False)
+        axis.set_major_locator(plt.MaxNLocator(3))
+    flat.contourf(position, action, q, 8, cmap=VALUES, antialiased=False)
+    flat.clabel(flat.contour(position, action, q, 8, colors="white", linewidths=0.5),
+                fontsize=7)
     for (label, actions), style in zip(lines.items(), ("-", "--")):
         flat.plot(position, actions, color="white", linewidth=3.5)
         flat.plot(position, actions, color="black", linestyle=style, label=label)
-    flat.set(xlabel="position", ylabel="action")
-    flat.legend(loc="lower left", frameon=True, framealpha=0.9)
+    flat.set(xlabel="position", ylabel="action", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
+    flat.legend(loc="lower left", fontsize=8, frameon=True)
     return axes
 
 
@@ -347,7 +355,7 @@ def plot_slices(action, truth, guesses, tops=False, ax=None, title=""):
             ax.plot(x, y, "o", markersize=7, zorder=4, color=line.get_color())
             ax.axvline(x, color=line.get_color(), linestyle=":", linewidth=1)
     ax.set(title=title, xlabel="action", ylabel="Q")
-    ax.legend()
+    ax.legend(loc="center left", bbox_to_anchor=(1, 0.5))
     return ax
 
 
@@ -369,34 +377,35 @@ def plot_decay(errors, share=0.01, ax=None, title=""):
     return ax
 
 
-def plot_learned_q(position, action, errors, curves, rms, axes=None, title=""):
+def plot_learned_q(position, action, errors, curves, limit, axes=None, title=""):
     """Above: maps of Q − truth at some moments. Below: its mean over all that time.
 
-    errors: a dict from an update to the error (Y, X) over action and position. curves:
-    a list of (updates (M,), mean error (M,)), one for each first network; rms (M,):
-    the root mean square of the first one's error.
+    errors: a dict from an update to the error (Y, X) over action and position; colours
+    end at ±limit. curves: a list, one for each first network, of arrays (3, M):
+    updates, mean error, root mean square error (drawn for the first network only).
     """
     if axes is None:
-        figure = plt.figure(figsize=(8, 5), layout="constrained")
+        figure = plt.figure(figsize=(7, 4.3), layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
         grid = figure.add_gridspec(2, len(errors))
         axes = [figure.add_subplot(grid[0, n]) for n in range(len(errors))]
         axes += [figure.add_subplot(grid[1, :])]
-    limit = max(np.abs(error).max() for error in errors.values())
     for ax, (update, error) in zip(axes, errors.items()):
         image = ax.imshow(error, origin="lower", aspect="auto", vmin=-limit, vmax=limit,
                           cmap=plt.get_cmap(ERRORS, 33), interpolation="nearest",
                           extent=(position[0], position[-1], action[0], action[-1]))
         ax.set_title(f"after {update:,} updates", loc="center", fontsize=9)
-        ax.set(xlabel="position", ylabel="action" if ax is axes[0] else "")
-    bar = axes[0].figure.colorbar(image, ax=axes[:-1])
+        ax.set(xlabel="position", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
+    axes[0].set_ylabel("action")
+    bar = axes[0].figure.colorbar(image, ax=axes[:-1], extend="both")
     bar.set_label("← under    over →", fontsize=8)
     below = axes[-1]
-    for n, (updates, mean) in enumerate(curves):
+    for n, (updates, mean, rms) in enumerate(curves):
         style = dict(color=ONE["color"], linewidth=1.8 if n == 0 else 0.7)
         label = {0: "mean error", 1: "mean error, other first networks"}.get(n)
         below.plot(updates, mean, label=label, **style)
-    below.plot(curves[0][0], rms, label="root mean square error", **TWO)
+        if n == 0:
+            below.plot(updates, rms, label="root mean square error", **TWO)
     below.axhline(0, color="black", linewidth=0.8)
     for update in errors:
         below.axvline(update, color=GREY, linewidth=0.8, linestyle=":")
@@ -484,6 +493,167 @@ def plot_price(slopes, bias, lost, axes=None, title=""):
         ax.legend()
     axes[0].set(ylabel=f"critic − truth\n{SIGN}")
     axes[1].set(ylabel="true value lost")
+    return axes
+
+
+# --- chapters 05, 06 ------------------------------------------------------------------
+
+
+def plot_one_backup(x, forms, samples, measured=None, xlabel="", ax=None, title=""):
+    """The bias that one target makes: closed forms as lines, samples as marks.
+
+    x (N,); forms: a dict from a label to (N,), in units of σ; samples: the same labels
+    to (x, bias) of simulated errors. measured: (low, high), the range of x that was
+    measured on trained critics, drawn as a grey band.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.4, 3.2), layout="constrained")
+    ax.axhline(0, **TRUTH)
+    if measured is not None:
+        ax.axvspan(*measured, color="0.85", linewidth=0)
+        ax.annotate("measured ", (measured[0], 0.02), ha="right", va="bottom",
+                    xycoords=("data", "axes fraction"), color="0.4", fontsize=8.5)
+    for (label, values), style in zip(forms.items(), (ONE, TWO, THREE)):
+        ax.plot(x, values, label=label, **style)
+        if label in samples:
+            ax.plot(*samples[label], "o", markersize=4.5, markerfacecolor="white",
+                    markeredgecolor=style["color"])
+    ax.set(title=title, xlabel=xlabel, ylabel=f"bias of one target / σ\n{SIGN}")
+    ax.yaxis.label.set_size(8)
+    ax.legend(loc="best")
+    return ax
+
+
+def plot_over_training(table, columns, log=(), axes=None, title=""):
+    """Recorded quantities during training: a thin line for each seed, their mean thick.
+
+    table: a DataFrame of `load_study`, any algorithms, one row per evaluation. columns:
+    a dict from a column's name to a panel's label. "bias" gets a zero line; a column
+    named in `log` a logarithmic axis. Steps at which something was not measured (NaN)
+    are passed over.
+    """
+    if axes is None:
+        figure, axes = plt.subplots(1, len(columns), figsize=(7.4, 2.9), squeeze=False,
+                                    layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    for ax, (column, label) in zip(np.ravel(axes), columns.items()):
+        if column == "bias":
+            ax.axhline(0, **TRUTH)
+            label = f"{label}\n{SIGN}"
+        for name, runs in table.groupby("algorithm", sort=False):
+            seeds = runs.pivot(index="step", columns="seed", values=column).dropna()
+            style = STYLE[name]
+            # Pale and without smooth edges: few colours, a small file.
+            ax.plot(seeds.index, seeds, color=_pale(style["color"]), linewidth=0.6,
+                    antialiased=False)
+            ax.plot(seeds.index, seeds.mean(axis=1), linewidth=2, label=name, **style,
+                    zorder=3)
+        ax.set(xlabel="environment steps", ylabel=label)
+        if column in log:
+            ax.set_yscale("log")
+        ax.xaxis.set_major_locator(plt.MaxNLocator(4))
+        _thousands(ax)
+    if table.algorithm.nunique() > 1:
+        np.ravel(axes)[-1].legend(loc="best")
+    return axes
+
+
+def _pale(colour, share=0.55):
+    """The colour, mixed with white."""
+    return share * np.ones(3) + (1 - share) * np.array(plt.matplotlib.colors.to_rgb(colour))
+
+
+def plot_parts(parts, ax=None, title=""):
+    """A bias and the two sums that it is made of: a mark for each run.
+
+    parts: a dict from an algorithm to (runs, 3): how far the critic lies above its own
+    targets, what the rule of the target adds, and both together, the bias.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.4, 3.2), layout="constrained")
+    ax.axhline(0, **TRUTH)
+    _note(ax, 0, SIGN)
+    for n, (name, values) in enumerate(parts.items()):
+        style = STYLE[name]
+        for m, column in enumerate(np.transpose(values)):
+            x = m + 0.2 * (n - (len(parts) - 1) / 2)
+            ax.plot([x - 0.07, x + 0.07], [column.mean()] * 2, linewidth=2.5,
+                    color=style["color"], label=name if m == 0 else None)
+            ax.plot(np.full(len(column), x), column, "o", markersize=4.5,
+                    markerfacecolor="white", markeredgecolor=style["color"])
+    ax.set_xticks(range(3), ["critic above its targets", "rule of the target",
+                             "sum = bias"])
+    ax.set(title=title, ylabel="mean over start states", xlim=(-0.5, 2.9))
+    _legend_below(ax)
+    return ax
+
+
+def plot_mean_planes(planes, limit, axes=None, title=""):
+    """Maps of the mean error: a row for each algorithm, a column for each time.
+
+    planes: a dict from an algorithm to a dict from a step to a picture with x (N,),
+    y (N,) and error (N, N). Colours end at ±limit.
+    """
+    rows, columns = len(planes), len(next(iter(planes.values())))
+    if axes is None:
+        figure, axes = plt.subplots(rows, columns, sharex=True, sharey=True,
+                                    figsize=(7.2, 1.6 * rows + 0.5), squeeze=False,
+                                    layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    for r, (name, pictures) in enumerate(planes.items()):
+        for ax, (step, picture) in zip(axes[r], pictures.items()):
+            image = _map(ax, picture, picture["error"], ERRORS, -limit, limit)
+            mean = picture["error"].mean()
+            ax.annotate(f"mean {mean:+.0f}".replace("-", "−"), (0.97, 0.04),
+                        xycoords="axes fraction", ha="right", fontsize=8.5,
+                        bbox=dict(facecolor="white", edgecolor="none", pad=1))
+            if np.allclose(picture["x"][-1], np.pi, atol=0.01):
+                _angle_ticks(ax)
+            if r == 0:
+                ax.set_title(f"step {step:,}".replace(",", " "), loc="center",
+                             fontsize=9)
+            if r < rows - 1:
+                ax.set_xlabel("")
+        axes[r, 0].set_ylabel(f"{name}\nvelocity")
+    bar = axes[0, 0].figure.colorbar(image, ax=axes, extend="both")
+    bar.set_label("← underestimates    overestimates →", fontsize=8)
+    return axes
+
+
+def plot_distance(curves, ax=None, title=""):
+    """The distance of two actors during their first updates: a line for each start.
+
+    curves: a dict from a label to (updates (M,), distance (M,)).
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(6.4, 3), layout="constrained")
+    for (label, values), style in zip(curves.items(), (ONE, TWO, THREE)):
+        ax.plot(*values, label=label, **style)
+    ax.set(title=title, xlabel="updates", ylabel="mean |a₁ − a₂|, a in [−1, 1]")
+    ax.legend()
+    return ax
+
+
+def plot_differences_by_seed(differences, axes=None, title=""):
+    """Paired differences: a dot for each seed, the mean, and its 95 % t interval.
+
+    differences: a dict from a panel's label to a dict from a pair's name to a pair
+    (values (n,), (low, high)).
+    """
+    if axes is None:
+        rows = max(map(len, differences.values()))
+        figure, axes = plt.subplots(1, len(differences), sharey=True,
+                                    figsize=(8, 1 + 0.6 * rows), layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    for ax, (label, pairs) in zip(np.ravel(axes), differences.items()):
+        ax.axvline(0, **TRUTH)
+        for n, (values, interval) in enumerate(pairs.values()):
+            ax.plot(values, np.full(len(values), n + 0.18), "o", markersize=4.5,
+                    markerfacecolor="white", markeredgecolor="0.4")
+            ax.plot(interval, [n, n], color="black", linewidth=1.5)
+            ax.plot(np.mean(values), n, "D", color="black", markersize=6)
+        ax.set_yticks(range(len(pairs)), list(pairs))
+        ax.set(xlabel=label, ylim=(len(pairs) - 0.5, -0.5))
     return axes
 
 

@@ -1,8 +1,9 @@
 """DDPG in sixty plain lines, and a loop that trains it: an oracle for the package.
 
 One critic, one actor, no leading axis, and none of the package's machinery but the
-random streams and Adam (which has a test of its own). Lillicrap et al. 2015, Algorithm 1. A layer's
-bias is the last row of its weights. Works where a time limit is the only end.
+random streams and Adam (which has a test of its own). Lillicrap et al. 2015,
+Algorithm 1. A layer's bias is the last row of its weights. Works where a time limit is
+the only end.
 """
 
 from itertools import pairwise

@@ -319,7 +319,7 @@ def test_without_kept_states_the_rows_are_there_and_say_n_0():
 def test_kept_states_are_measured_four_times_in_a_run(steps, every, expected):
     config = Config("HalfCheetah-v5", steps=steps, evaluate_every=every)
     grid = range(every, steps + 1, every)
-    found = [step for step in grid if instrument._reaches_a_part(config, step, 4)]
+    found = [step for step in grid if instrument._reaches_a_quarter(config, step)]
     assert found == expected
 
 
@@ -672,9 +672,9 @@ def test_a_plane_holds_the_other_variables_fixed():
     world.observe, observe = lambda s: seen.append(s) or observe(s), world.observe
     instrument.plane(agent, world, size=3)
     assert (seen[0][:, 2:] == [100, 100, 0]).all()  # the easy goal
-    instrument.plane(agent, world, "goal x", "goal y", fixed=[1, 2, 0, 0, 0], size=3)
+    instrument.plane(agent, world, "goal x", "goal y", fixed=[1, 2, 0, 0, 0], size=4)
     moved = next(s for s in seen if (s[:, :2] == [1, 2]).all())
-    assert np.array_equal(np.unique(moved[:, 2]), [0, 200, 400])
+    assert np.allclose(np.unique(moved[:, 2]), [0, 400 / 3, 800 / 3, 400])
 
 
 def test_a_summary_says_mean_standard_error_and_n():

@@ -28,7 +28,7 @@ from dnddpg_minimal import (
 )
 from dnddpg_minimal.dnddpg import adam
 
-# --- targets: Eq. (11) and Eq. (12) -----------------------------------------------------
+# --- targets: Eq. (11) and Eq. (12) ---------------------------------------------------
 
 # Two critics (rows), two actors (columns), two transitions: [c][k] = (first, second).
 #   first:   min at actor 1 is 2, at actor 2 is 5; Eq. (12) compares 8 with 6: actor 1
@@ -156,7 +156,7 @@ def test_pure_noise_moves_the_target_as_the_closed_form_says(critics, actors,
     assert abs(y.mean() - closed_form) < 4 * y.std() / math.sqrt(n)
 
 
-# --- the better of two actions: Eq. (12) ------------------------------------------------
+# --- the better of two actions: Eq. (12) ----------------------------------------------
 
 
 def test_eq_12_takes_the_actor_whose_own_critic_is_happier():
@@ -191,7 +191,7 @@ def test_a_wrong_act_rule_is_answered_with_the_nearest_right_one():
         choose_actor(Q_NEXT, "pared")
 
 
-# --- replay -----------------------------------------------------------------------------
+# --- replay ---------------------------------------------------------------------------
 
 
 def numbered(replay, numbers):
@@ -254,7 +254,7 @@ def test_replay_draws_from_its_own_stream_only():
     np.testing.assert_array_equal(a.reward, second.sample(30).reward)
 
 
-# --- random streams ---------------------------------------------------------------------
+# --- random streams -------------------------------------------------------------------
 
 
 def test_every_use_has_a_stream_of_its_own():
@@ -269,7 +269,7 @@ def test_a_stream_starts_again_at_the_same_number():
     assert stream(3, "noise").random() == stream(3, "noise").random()
 
 
-# --- exploration noise ------------------------------------------------------------------
+# --- exploration noise ----------------------------------------------------------------
 
 
 def test_gaussian_noise_is_drawn_anew_for_each_dimension_and_step():
@@ -313,7 +313,7 @@ def test_sigma_zero_is_no_noise():
         np.testing.assert_array_equal(noise.sample(), np.zeros(3))
 
 
-# --- configuration ----------------------------------------------------------------------
+# --- configuration --------------------------------------------------------------------
 
 
 def test_nothing_given_is_dn_ddpg_on_pendulum():
@@ -490,7 +490,7 @@ def test_a_config_goes_through_json_unchanged():
         assert Config(**dataclasses.asdict(config)) == config
 
 
-# --- units of the task ------------------------------------------------------------------
+# --- units of the task ----------------------------------------------------------------
 
 SPACE = gym.spaces.Box(np.float32([-2, 0]), np.float32([2, 10]))
 
@@ -507,7 +507,7 @@ def test_to_env_works_on_a_batch():
     np.testing.assert_array_equal(to_env(action, SPACE), [[-2, 0], [2, 10], [1, 4]])
 
 
-# --- which tasks are accepted -----------------------------------------------------------
+# --- which tasks are accepted ---------------------------------------------------------
 
 
 def test_any_flat_task_with_bounded_actions_is_accepted():
@@ -542,7 +542,7 @@ def test_a_task_that_does_not_fit_is_refused_with_the_reason(task, options, word
     assert repr(task) in str(refusal.value)
 
 
-# --- agents -----------------------------------------------------------------------------
+# --- agents ---------------------------------------------------------------------------
 
 TINY = dict(hidden=(6, 5), batch_size=4, warmup=0)
 AGENTS = pytest.mark.parametrize("kind", [NumpyAgent, TorchAgent])
@@ -658,7 +658,7 @@ def test_the_first_weights_are_uniform_in_one_over_root_inputs(tmp_path):
     assert len(theta) == (10 * 40 + 41 * 30 + 31 * 1) + (9 * 40 + 41 * 30 + 31 * 1)
 
 
-# --- one update -------------------------------------------------------------------------
+# --- one update -----------------------------------------------------------------------
 
 
 @AGENTS
@@ -759,7 +759,7 @@ def test_diverging_critics_are_noticed_at_once(kind):
         agent.update(batch._replace(reward=np.full(4, np.inf, np.float32)))
 
 
-# --- Adam -------------------------------------------------------------------------------
+# --- Adam -----------------------------------------------------------------------------
 
 
 def descend(gradients, lr=0.1, theta=0.0):
@@ -808,7 +808,7 @@ def test_adam_equals_pytorchs_over_600_steps():
     np.testing.assert_allclose(theta, theirs.detach().numpy(), rtol=0, atol=1e-12)
 
 
-# --- an agent's file --------------------------------------------------------------------
+# --- an agent's file ------------------------------------------------------------------
 
 
 @AGENTS
@@ -856,7 +856,8 @@ def test_npz_brings_arrays_and_texts_back(tmp_path):
     content = read_npz(tmp_path / "a.npz")
     assert set(content) == {"n", "text", "x"}
     assert int(content["n"]) == 3 and str(content["text"]) == "γ"
-    assert content["x"].dtype == np.float32 and content["x"].tolist() == [[1, 0], [0, 1]]
+    assert content["x"].dtype == np.float32
+    assert content["x"].tolist() == [[1, 0], [0, 1]]
 
 
 class Trap:

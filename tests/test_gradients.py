@@ -47,7 +47,7 @@ def slope(function, vector, entry, h=1e-6):
     return (above - below) / (2 * h)
 
 
-# --- the pieces: forward and backward ---------------------------------------------------
+# --- the pieces: forward and backward -------------------------------------------------
 
 
 def test_a_network_by_hand():
@@ -140,7 +140,7 @@ def test_backward_is_autograd():
     np.testing.assert_allclose(daction, a.grad, rtol=0, atol=1e-12)
 
 
-# --- the gradients inside a whole update ------------------------------------------------
+# --- the gradients inside a whole update ----------------------------------------------
 #
 # After the first update Adam's first moment is (1 - 0.9) times the gradient, so an
 # agent's own file tells which gradient it used.
@@ -232,7 +232,7 @@ def test_the_actors_gradient_is_the_slope_of_eq_4(kind, algorithm, climbs, tmp_p
     assert abs(d @ gradient).min() > 1e-4
 
 
-# --- NumPy against PyTorch: the same weights and batches in, the same out ---------------
+# --- NumPy against PyTorch: the same weights and batches in, the same out -------------
 
 
 def apart(first, second):
@@ -284,7 +284,8 @@ def test_one_update_in_float32_agrees_to_one_millionth(algorithm, tmp_path):
 
 def test_both_agents_start_from_the_same_weights():
     obs, action = random_input()
-    ours, theirs = (kind(tiny_config(), OBS, ACTION) for kind in (NumpyAgent, TorchAgent))
+    ours = NumpyAgent(tiny_config(), OBS, ACTION)
+    theirs = TorchAgent(tiny_config(), OBS, ACTION)
     np.testing.assert_allclose(ours.q_values(obs, action), theirs.q_values(obs, action))
     np.testing.assert_allclose(ours.actions(obs), theirs.actions(obs))
     np.testing.assert_allclose(ours.q_next(obs), theirs.q_next(obs))

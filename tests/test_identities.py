@@ -36,7 +36,7 @@ def some_actions(action_dim=1, size=50):
     return np.random.default_rng(1).uniform(-1, 1, (size, action_dim))
 
 
-# --- C = K = 1 against sixty lines without the leading axis -----------------------------
+# --- C = K = 1 against sixty lines without the leading axis ---------------------------
 
 
 @pytest.mark.parametrize("batch_size", [16, 17])
@@ -55,7 +55,7 @@ def test_one_critic_and_one_actor_are_plain_ddpg(batch_size, tmp_path):
         assert np.array_equal(arrays[name], flat), name
 
 
-# --- the second critic and the second actor, when they have nothing to add --------------
+# --- the second critic and the second actor, when they have nothing to add ------------
 
 
 @pytest.mark.parametrize("batch_size", [16, 17])
@@ -99,7 +99,7 @@ def test_with_one_actor_and_one_critic_there_is_nothing_to_choose(rule):
     assert returns(chosen) == returns(trained("DDPG"))
 
 
-# --- the same seed gives the three algorithms the same start ----------------------------
+# --- the same seed gives the three algorithms the same start --------------------------
 
 
 def test_critic_1_and_actor_1_start_equal_in_all_three_algorithms():

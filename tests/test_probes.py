@@ -9,9 +9,9 @@ import pytest
 
 from dnddpg_minimal import ALGORITHMS, Config, Training, probes
 
-GAMMA = 0.8
-FAST = dict(hidden=(16, 16), batch_size=32, warmup=200, gamma=GAMMA, tau=0.05,
-            critic_lr=3e-3, sigma=0.3)
+GAMMA = 0.5
+FAST = dict(hidden=(16, 16), batch_size=32, warmup=100, gamma=GAMMA, tau=0.1,
+            critic_lr=5e-3, actor_lr=3e-3, sigma=0.3)
 ALL_THREE = pytest.mark.parametrize("algorithm", ALGORITHMS)
 
 
@@ -30,7 +30,7 @@ def at_replay(training):
             task.true_q(stored.obs, stored.action, GAMMA))
 
 
-# --- the closed forms, at points that can be worked out on paper ------------------------
+# --- the closed forms, at points that can be worked out on paper ----------------------
 
 
 def test_the_truths_by_hand():
@@ -47,57 +47,58 @@ def test_the_truths_by_hand():
     assert q(probes.TwoSteps, [0.5, 1.0], action=-1) == 0.75  # its action is too late
 
 
-# --- learned ----------------------------------------------------------------------------
+# --- learned --------------------------------------------------------------------------
 
 
 @ALL_THREE
 def test_a_reward_of_1_for_ever_is_worth_1_over_1_minus_gamma(algorithm):
     """The time limit of 20 steps is no end: a critic that stopped there learns less."""
-    q, truth = at_replay(learned("ConstantReward", 600, algorithm,
+    q, truth = at_replay(learned("ConstantReward", 400, algorithm,
                                  max_episode_steps=20))
-    assert truth[0] == pytest.approx(5)
-    assert abs(q - truth).max() < 0.4
+    assert truth[0] == pytest.approx(2)
+    assert abs(q - truth).max() < 0.25
 
 
 def test_the_probe_catches_a_time_limit_taken_for_an_end():
-    q, truth = at_replay(learned("ConstantReward", 600, "DDPG", max_episode_steps=5,
+    """One end in two steps: Q = 1 + gamma Q / 2, which is 4/3 instead of 2."""
+    q, truth = at_replay(learned("ConstantReward", 400, "DDPG", max_episode_steps=2,
                                  ends="any_end"))
-    assert (q < truth - 1).all()
+    assert abs(q - 4 / 3).mean() < 0.2
 
 
 @ALL_THREE
 def test_a_real_end_is_worth_nothing_afterwards(algorithm):
-    q, truth = at_replay(learned("RealEnd", 1_200, algorithm))
-    assert truth.std() > 0.8
-    assert abs(q - truth).max() < 0.4
+    q, truth = at_replay(learned("RealEnd", 500, algorithm))
+    assert truth.std() > 0.3
+    assert (abs(q - truth).mean(axis=1) < 0.2).all()
 
 
 def test_the_probe_catches_a_bootstrap_through_a_real_end():
     """Then the last reward is followed by more, out of nowhere."""
-    training = learned("RealEnd", 1_200, "DDPG", ends="none")
+    training = learned("RealEnd", 500, "DDPG", ends="none")
     q, truth = at_replay(training)
-    last = training.replay.arrays.obs[:, 0] < 0.3  # one step is left: the truth is 1
+    last = training.replay.arrays.obs[:, 0] < 0.3  # one step is left
     assert truth[last] == pytest.approx(1)
-    assert q[0, last].mean() > 1.6
+    assert q[0, last].mean() > 1.6  # near 2: a reward for ever
 
 
 @ALL_THREE
 def test_the_critics_read_the_reward_from_the_observation(algorithm):
-    training = learned("ObservedReward", 1_200, algorithm)
+    training = learned("ObservedReward", 600, algorithm)
     q, truth = at_replay(training)
-    assert abs(q.mean(axis=1) - truth.mean()).max() < 0.3
+    assert abs(q.mean(axis=1) - truth.mean()).max() < 0.25
     low, high = training.agent.q_values([[0.0], [1.0]], [[0.0], [0.0]]).T
     assert abs(high - low - 1).max() < 0.3  # the truth rises by 1
 
 
 @ALL_THREE
 def test_a_reward_one_step_later_is_discounted_once_and_the_actor_finds_it(algorithm):
-    training = learned("TwoSteps", 1_500, algorithm, actor_lr=3e-3)
+    training = learned("TwoSteps", 800, algorithm)
     q, truth = at_replay(training)
-    assert truth.std() > 0.1
-    assert (abs(q - truth).mean(axis=1) < 0.06).all()
+    assert truth.std() > 0.2
+    assert (abs(q - truth).mean(axis=1) < 0.08).all()
     start = np.zeros((1, 2))
-    assert abs(training.agent.actions(start) - 0.5).max() < 0.3  # every actor
+    assert abs(training.agent.actions(start) - 0.5).max() < 0.4  # every actor
 
 
 @ALL_THREE
@@ -106,7 +107,7 @@ def test_the_critics_learn_what_the_bounded_actors_really_cost(algorithm):
 
     The closed form is for the best policy, so it bounds the truth from above.
     """
-    agent = learned("LinearQuadratic", 1_200, algorithm, max_episode_steps=20).agent
+    agent = learned("LinearQuadratic", 800, algorithm, max_episode_steps=20).agent
     task, rng = probes.LinearQuadratic, np.random.default_rng(0)
     states, first = task.start_states(rng, 200), rng.uniform(-1, 1, (200, 1))
     truth, now, action = np.zeros(200), states, first
@@ -116,22 +117,22 @@ def test_the_critics_learn_what_the_bounded_actors_really_cost(algorithm):
         action = agent.act(task.observe(now))
     obs = task.observe(states)
     error = agent.q_values(obs, first) - truth
-    assert truth.std() > 0.4
-    assert (abs(error).mean(axis=1) < 0.2).all()
-    assert (abs(error.mean(axis=1)) < 0.1).all()
+    assert truth.std() > 0.25
+    assert (abs(error).mean(axis=1) < 0.12).all()
+    assert (abs(error.mean(axis=1)) < 0.08).all()
     best = task.true_q(obs, first, GAMMA)
-    assert (truth < best + 1e-3).all() and (best - truth).mean() < 0.1
+    assert (truth < best + 1e-3).all() and (best - truth).mean() < 0.05
 
 
-# --- the same by autograd ---------------------------------------------------------------
+# --- the same by autograd -------------------------------------------------------------
 
 
 def test_pytorch_learns_a_reward_for_ever():
-    q, truth = at_replay(learned("ConstantReward", 600, backend="torch",
+    q, truth = at_replay(learned("ConstantReward", 400, backend="torch",
                                  max_episode_steps=20))
-    assert abs(q - truth).max() < 0.4
+    assert abs(q - truth).max() < 0.3
 
 
 def test_pytorch_learns_a_real_end():
-    q, truth = at_replay(learned("RealEnd", 800, backend="torch", algorithm="DDPG"))
-    assert abs(q - truth).max() < 0.4
+    q, truth = at_replay(learned("RealEnd", 500, backend="torch", algorithm="DDPG"))
+    assert abs(q - truth).mean() < 0.2

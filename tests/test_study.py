@@ -10,15 +10,25 @@ import sys
 import time
 import warnings
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dnddpg_minimal import Batch, Config, Training, bias, bugs, study
-from dnddpg_minimal.dnddpg import KEPT, to_env
+from dnddpg_minimal import (
+    Batch,
+    Config,
+    NumpyAgent,
+    Training,
+    bias,
+    bugs,
+    make_agent,
+    study,
+    to_env,
+)
 
-TINY = dict(steps=900, warmup=100, hidden=(16, 16), batch_size=16, evaluate_every=300)
+TINY = dict(steps=600, warmup=100, hidden=(16, 16), batch_size=16, evaluate_every=300)
 SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -28,11 +38,12 @@ def tiny(algorithm="DN-DDPG", seed=0, task="Pendulum-v1", bug=None, **choices):
 
 
 def content(path):
-    """A record's meta, wall time aside, and its arrays."""
+    """A record's meta, and its arrays; without what says when it was made."""
     with np.load(path) as file:
         arrays = dict(file)
     meta = json.loads(str(arrays.pop("meta")))
-    del meta["seconds"]
+    for name in ("seconds", "revision", "code"):  # other files may be edited meanwhile
+        del meta[name]
     return meta, arrays
 
 
@@ -50,7 +61,7 @@ def path_of(run, folder):
 
 @pytest.fixture(scope="module")
 def runs():
-    return [tiny(algorithm, seed) for seed in (0, 1) for algorithm in ("DDPG", "DN-DDPG")]
+    return [tiny(name, seed) for seed in (0, 1) for name in ("DDPG", "DN-DDPG")]
 
 
 @pytest.fixture(scope="module")
@@ -109,8 +120,6 @@ def test_the_class_budget_is_the_issues_list():
 
 
 def test_a_control_has_as_many_weights_as_the_agent_it_stands_for():
-    from dnddpg_minimal import make_agent
-
     ours = make_agent(Config("Pendulum-v1", "DN-DDPG"), 3, 1)
     wide = make_agent(Config("Pendulum-v1", "DDPG", hidden=(92, 92)), 3, 1)
     assert len(wide.theta) == pytest.approx(len(ours.theta), rel=0.03)
@@ -128,12 +137,12 @@ def test_an_unknown_budget_or_what_is_refused_by_name(tmp_path):
 
 def test_tables_have_the_columns_of_the_contract(undisturbed):
     table = study.load_study(variant="tiny", folder=undisturbed)
-    assert len(table) == 4 * 3  # four runs, three evaluations
+    assert len(table) == 4 * 2  # four runs, two evaluations
     assert list(table.columns[:9]) == ["task", "algorithm", "variant", "seed", "step",
                                        "updates", "mean", "standard_error", "n"]
     assert {"delta", "sigma", "kappa", "rho", "actor_distance"} <= set(table.columns)
-    assert list(table.step.unique()) == [300, 600, 900]
-    assert list(table.updates.unique()) == [200, 500, 800]
+    assert list(table.step.unique()) == [300, 600]
+    assert list(table.updates.unique()) == [200, 500]
 
     rows = study.load_study(variant="tiny", what="bias", folder=undisturbed)
     assert {"states", "action", "critic", "q", "truth", "bias", "standard_error", "n",
@@ -184,7 +193,7 @@ def test_episodes_losses_and_versions_are_recorded(undisturbed, runs):
     one = study.load_study("Pendulum-v1", "DN-DDPG", "tiny", "episodes", undisturbed)[0]
     training = Training(runs[1].config)
     episodes = [item for item in training if item.kind == "episode"]
-    assert list(one["step"]) == [item.step for item in episodes] == [200, 400, 600, 800]
+    assert list(one["step"]) == [item.step for item in episodes] == [200, 400, 600]
     np.testing.assert_array_equal(
         one["episode_return"], np.float32([item.episode_return for item in episodes]))
     meta = study.load_study(variant="tiny", what="meta", folder=undisturbed)[0]
@@ -202,9 +211,9 @@ def test_a_record_names_neither_the_machine_nor_its_folders(undisturbed, runs):
     assert str(Path.home()) not in text and str(undisturbed) not in text
 
 
-def test_planes_weights_and_visits(tmp_path):
-    config = Config("Pendulum-v1", "DN-DDPG", **TINY | dict(steps=400, warmup=50,
-                                                            evaluate_every=100))
+def test_planes_weights_and_visits(tmp_path, monkeypatch):
+    monkeypatch.setattr(bias, "plane", partial(bias.plane, size=9))
+    config = tiny(steps=400, warmup=50, evaluate_every=100).config
     training = Training(config)
     planes = {}
     for item in training:
@@ -215,10 +224,9 @@ def test_planes_weights_and_visits(tmp_path):
     picture, = study.load_study(what="planes", folder=tmp_path)
     assert list(picture["step"]) == [100, 200, 400]  # 40, 10 %, is not on the grid
     for i, step in enumerate(picture["step"]):
-        np.testing.assert_allclose(picture["q"][i], planes[step]["q"], rtol=1e-3,
-                                   atol=1e-3)
-        np.testing.assert_allclose(picture["truth"][i], planes[step]["truth"], rtol=1e-3,
-                                   atol=1e-3)
+        for name in ("q", "truth"):  # float16: three digits
+            np.testing.assert_allclose(picture[name][i], planes[step][name], rtol=1e-3,
+                                       atol=1e-3)
     np.testing.assert_allclose(picture["x"], planes[400]["x"], rtol=1e-6)
 
     weights, = study.load_study(what="weights", folder=tmp_path)
@@ -250,7 +258,7 @@ def test_the_score_is_the_mean_of_the_last_ten_evaluations_or_five_on_mujoco():
 # --- interruption ---------------------------------------------------------------------
 
 
-class Crash(Exception):
+class CrashError(Exception):
     pass
 
 
@@ -262,13 +270,13 @@ class Crash(Exception):
 def test_a_crash_and_a_resumption_change_nothing(task, choices, tmp_path, monkeypatch):
     run = tiny(task=task, **choices)
     study.record(run, tmp_path / "whole", tmp_path / "scratch")
-    measure, crashes = study.measure, iter([350, 470, 480])
+    measure, crashes = study.measure, iter([210, 420, 450])
     crash_at = next(crashes)
 
     def measure_and_crash(run, training, item, notes):
         measure(run, training, item, notes)
         if crash_at is not None and item.step >= crash_at:
-            raise Crash
+            raise CrashError
 
     monkeypatch.setattr(study, "measure", measure_and_crash)
     tries = 0
@@ -276,10 +284,10 @@ def test_a_crash_and_a_resumption_change_nothing(task, choices, tmp_path, monkey
         tries += 1
         try:
             study.record(run, tmp_path / "torn", tmp_path / "scratch", every=0)
-        except Crash:
+        except CrashError:
             crash_at = next(crashes, None)
     assert tries == 4
-    assert_same_record(path_of(run, tmp_path / "whole"), path_of(run, tmp_path / "torn"))
+    assert_same_record(*(path_of(run, tmp_path / name) for name in ("whole", "torn")))
     assert not list((tmp_path / "scratch").glob("*.npz"))
 
 
@@ -486,7 +494,7 @@ def test_an_empty_folder_gives_an_empty_table(tmp_path):
     assert study.load_study(what="planes", folder=tmp_path) == []
 
 
-def test_three_hundred_and_fifty_records_load_in_two_seconds(tmp_path, undisturbed, runs):
+def test_350_records_load_in_two_seconds(tmp_path, undisturbed, runs):
     import pandas  # noqa: F401  its import is not ours to time
 
     data = path_of(runs[1], undisturbed).read_bytes()
@@ -498,7 +506,7 @@ def test_three_hundred_and_fifty_records_load_in_two_seconds(tmp_path, undisturb
         begun = time.process_time()
         table = study.load_study(variant="tiny", what=what, folder=tmp_path)
         assert time.process_time() - begun < 2
-        assert len(table) >= 350 * 3
+        assert len(table) >= 350 * 2
 
 
 # --- the command ----------------------------------------------------------------------
@@ -520,13 +528,15 @@ def test_a_choice_that_matches_no_run_is_refused(tmp_path):
         study.main(["--task", "Pendulum", "--folder", str(tmp_path)])
 
 
-COMMAND = [sys.executable, "-m", "dnddpg_minimal", "study", "--budget", "quick", "--task",
-           "Pendulum-v1", "MountainCarContinuous-v0", "--workers", "2"]
+def command_in(folder):
+    return [sys.executable, "-m", "dnddpg_minimal", "study", "--budget", "quick",
+            "--task", "Pendulum-v1", "MountainCarContinuous-v0",
+            "--folder", str(folder), "--scratch", str(folder / "scratch")]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="sends SIGINT to one process")
 def test_ctrl_c_keeps_what_is_there_and_the_same_command_goes_on(tmp_path):
-    words = [*COMMAND, "--folder", str(tmp_path), "--scratch", str(tmp_path / "scratch")]
+    words = command_in(tmp_path)
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                                text=True)
     deadline = time.monotonic() + 60
@@ -555,8 +565,7 @@ def alive(pid):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_workers_end_when_their_study_is_killed(tmp_path):
-    words = [*COMMAND, "--folder", str(tmp_path), "--scratch", str(tmp_path / "scratch")]
-    process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command_in(tmp_path), stdout=subprocess.DEVNULL)
     tasks = Path(f"/proc/{process.pid}/task/{process.pid}/children")
     deadline = time.monotonic() + 60
     while not list((tmp_path / "scratch").glob("*.lock")):
@@ -628,29 +637,23 @@ def slope_of(agent, loss, i, step=1e-6):
     return (above - below) / (2 * step)
 
 
-def critic_gradient(agent, batch):
-    """What an update hands to Adam for the critic: (P,)."""
-    seen = []
-    original = type(agent).__mro__[1]._adam
-    agent_adam = type(agent)._adam
+@pytest.fixture
+def critic_gradient(monkeypatch):
+    """The gradients that updates hand to Adam for the critics, one after the other."""
+    seen, adam = [], NumpyAgent._adam
 
     def spy(self, part, lr):
         if part.start == 0:
             seen.append(self.dtheta[part].copy())
-        original(self, part, lr)
+        adam(self, part, lr)
 
-    type(agent).__mro__[1]._adam = spy
-    try:
-        agent_adam  # the subclass may add to dtheta before it calls the spy
-        agent.update(batch)
-    finally:
-        type(agent).__mro__[1]._adam = original
-    return seen[0]
+    monkeypatch.setattr(NumpyAgent, "_adam", spy)
+    return seen
 
 
-def test_the_lost_axis_has_the_gradient_of_every_q_against_every_y(rng=None):
+def test_the_lost_axis_has_the_gradient_of_every_q_against_every_y(critic_gradient):
     rng = np.random.default_rng(0)
-    agent, batch = faulty_agent(bugs.LostAxisAgent), some_batch(np.random.default_rng(1))
+    agent, batch = faulty_agent(bugs.LostAxisAgent), some_batch(rng)
     right = super(bugs.LostAxisAgent, agent).td_target(batch)  # (B,)
 
     def wrong_loss():
@@ -660,16 +663,13 @@ def test_the_lost_axis_has_the_gradient_of_every_q_against_every_y(rng=None):
     chosen = rng.choice(agent.split, 12, replace=False)
     slopes = [slope_of(agent, wrong_loss, i) for i in chosen]
     loss = wrong_loss()
-    theta = agent.theta.copy()
-    gradient = critic_gradient(agent, batch)
-    np.testing.assert_allclose(gradient[chosen], slopes, rtol=1e-5, atol=1e-8)
-    agent.theta[:] = theta
     assert agent.update(batch)["critic"][0] == pytest.approx(loss)
+    np.testing.assert_allclose(critic_gradient[0][chosen], slopes, rtol=1e-5, atol=1e-8)
 
 
-def test_the_gradient_through_y_is_that_of_the_whole_loss():
+def test_the_gradient_through_y_is_that_of_the_whole_loss(critic_gradient):
     rng = np.random.default_rng(0)
-    agent, batch = faulty_agent(bugs.ThroughYAgent), some_batch(np.random.default_rng(1))
+    agent, batch = faulty_agent(bugs.ThroughYAgent), some_batch(rng)
     next_action = agent.act(batch.next_obs)
 
     def loss():
@@ -679,12 +679,12 @@ def test_the_gradient_through_y_is_that_of_the_whole_loss():
 
     chosen = rng.choice(agent.split, 12, replace=False)
     slopes = [slope_of(agent, loss, i) for i in chosen]
-    gradient = critic_gradient(agent, batch)
-    np.testing.assert_allclose(gradient[chosen], slopes, rtol=1e-5, atol=1e-8)
+    agent.update(batch)
+    np.testing.assert_allclose(critic_gradient[0][chosen], slopes, rtol=1e-5, atol=1e-8)
 
 
 def test_with_one_seed_every_episode_starts_alike():
-    training = bugs.OneSeed(tiny("DDPG", warmup=900).config)
+    training = bugs.OneSeed(tiny("DDPG").config)
     starts = [training.env.reset(seed=seed)[0] for seed in (1, 2, 3)]
     np.testing.assert_array_equal(starts[0], starts[1])
     np.testing.assert_array_equal(starts[0], starts[2])
@@ -768,7 +768,3 @@ def test_two_thousand_steps_of_a_recorded_run_repeat_themselves(algorithm):
     there = meta["processor"], meta.get("blas"), meta["versions"]["numpy"]
     if here == there:
         assert study.fingerprint(training) == meta["probe"]
-
-
-def test_kept_states_fit_what_the_study_expects():
-    assert KEPT == 64

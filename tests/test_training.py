@@ -44,7 +44,8 @@ def standard_run():
 
 
 def toy_run(steps=60, **choices):
-    training = Training(Config("Toy-v0", **SMALL | dict(steps=steps, warmup=20) | choices))
+    choices = SMALL | dict(steps=steps, warmup=20) | choices
+    training = Training(Config("Toy-v0", **choices))
     return training, list(training)
 
 
@@ -68,7 +69,7 @@ def assert_same_run(first, second, tmp_path):
         np.testing.assert_array_equal(b[name], array, err_msg=name)
 
 
-# --- the same seed, the same history ----------------------------------------------------
+# --- the same seed, the same history --------------------------------------------------
 
 
 @pytest.mark.parametrize("backend", ["numpy", "torch"])
@@ -101,7 +102,7 @@ def test_looking_at_the_agent_on_the_way_changes_nothing():
     assert_same_records(told, standard_run()[1])
 
 
-# --- records ----------------------------------------------------------------------------
+# --- records --------------------------------------------------------------------------
 
 
 def test_an_episode_record_comes_at_each_episodes_end():
@@ -192,7 +193,7 @@ def test_with_episodes_given_the_grid_is_still_one_of_steps():
         8, 16, 24, 32, 40]
 
 
-# --- what happens in a step -------------------------------------------------------------
+# --- what happens in a step -----------------------------------------------------------
 
 
 def test_warm_up_makes_no_update():
@@ -296,7 +297,7 @@ def test_frozen_actors_slow_copies_come_to_rest_on_them():
                                training.agent.actions(obs), atol=1e-5)
 
 
-# --- ends: of the world, and of the clock -----------------------------------------------
+# --- ends: of the world, and of the clock ---------------------------------------------
 
 
 def ends_stored(ends, **task_options):
@@ -330,7 +331,7 @@ def test_ends_any_end_is_the_common_bug():
     assert ends_stored("any_end", ends_after=4) == every(4)
 
 
-# --- kept simulator states --------------------------------------------------------------
+# --- kept simulator states ------------------------------------------------------------
 
 
 def test_one_state_in_156_steps_is_kept_from_before_its_step():
@@ -363,7 +364,7 @@ def test_which_steps_are_kept_is_drawn_from_the_seed_alone():
     assert first == second != third
 
 
-# --- what a task must not return --------------------------------------------------------
+# --- what a task must not return ------------------------------------------------------
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -399,7 +400,7 @@ def test_one_thread_inside_and_the_callers_number_outside():
     assert seen == [{1}] * 12
 
 
-# --- resume, bit for bit ----------------------------------------------------------------
+# --- resume, bit for bit --------------------------------------------------------------
 
 
 def resumed(training, save_at, path):
@@ -505,7 +506,7 @@ def test_kept_states_and_first_losses_survive(tmp_path):
     np.testing.assert_array_equal(whole.first_losses, again.first_losses)
 
 
-# --- killed at a random moment ----------------------------------------------------------
+# --- killed at a random moment --------------------------------------------------------
 
 CHILD = """
 import sys, time
@@ -551,7 +552,7 @@ def test_a_run_killed_at_a_random_moment_goes_on_as_if_never_killed(task, tmp_pa
     assert_same_run(again, whole, tmp_path)
 
 
-# --- files that are no runs -------------------------------------------------------------
+# --- files that are no runs -----------------------------------------------------------
 
 
 def test_a_damaged_or_foreign_run_is_refused(tmp_path):
@@ -604,7 +605,7 @@ def test_there_is_nothing_to_load_where_nothing_is(tmp_path):
         Training.load(tmp_path / "nothing.npz")
 
 
-# --- the eight tasks --------------------------------------------------------------------
+# --- the eight tasks ------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", [
