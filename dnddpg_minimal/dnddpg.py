@@ -12,13 +12,13 @@ Networks of one kind stand side by side: every array of weights has a leading ax
 (C critics or K actors), and all of them are views into one flat vector.
 
     equation of the paper                        here
-    (1)  slow copies follow                      NumpyAgent.update, TorchAgent.update
+    (1)  slow copies follow                      Agent.update
     (2)  J = E[r1 + gamma r2 + ...]              what Training tries to make large
-    (3)  mean squared TD error                   NumpyAgent.update, TorchAgent.update
-    (4)  policy gradient                         NumpyAgent.update, TorchAgent.update
+    (3)  mean squared TD error                   Agent.update, NumpyAgent.fit_critics
+    (4)  policy gradient                         Agent.update, NumpyAgent.climb_critics
     (5)-(10) overestimation                      measured, in bias.py
     (11) y = r + gamma min of two critics        td_target
-    (12) the better of two actions               choose_actor, td_target
+    (12) the better of two actions               choose_actor, td_target, Agent.act
 
 Where the paper is silent or contradicts itself, the choice is a field of `Config`,
 and the default is named there. The largest difference: Eq. (11) as printed uses one
@@ -36,7 +36,9 @@ import math
 import os
 import re
 import warnings
+from collections import defaultdict
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -59,37 +61,53 @@ _PROBE = _SMALL | dict(steps=10_000, hidden=(32, 32), gamma=0.9, tau=0.05, warmu
 MUJOCO_TASKS = ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Humanoid-v5")
 PROBE_TASKS = ("ConstantReward-v0", "RealEnd-v0", "ObservedReward-v0", "TwoSteps-v0",
                "LinearQuadratic-v0")
-PRESETS = {
-    "Pendulum-v1": _SMALL,
-    "ArmEasy-v0": _ARM,
-    "ArmHard-v0": _ARM,
-    "MountainCarContinuous-v0": _CAR,
-    **dict.fromkeys(MUJOCO_TASKS, _MUJOCO),
-    **dict.fromkeys(PROBE_TASKS, _PROBE),
-}  # any other task takes the row of Pendulum
+PRESETS = {"Pendulum-v1": _SMALL, "ArmEasy-v0": _ARM, "ArmHard-v0": _ARM,
+           "MountainCarContinuous-v0": _CAR, **dict.fromkeys(MUJOCO_TASKS, _MUJOCO),
+           **dict.fromkeys(PROBE_TASKS, _PROBE)}  # any other task: the row of Pendulum
 MAX_REPLAY = 100_000  # transitions, Table 1, row 6
 
-CHOICES = {
-    "target_rule": ("max_min", "single", "paired_min", "selected", "soft"),
-    "act_rule": ("paired", "max_min", "first"),
-    "climbs": ("own", "first"),
-    "init": ("independent", "tied_actors", "tied_critics"),
-    "ends": ("terminated", "none", "any_end"),
-    "noise": ("gaussian", "ou"),
-    "backend": ("numpy", "torch"),
-    "dtype": ("float32", "float64"),
-}
-_TINY, _INF = np.nextafter(0, 1), math.inf  # _TINY: the smallest number above 0
-RANGES = {  # (kind, lowest, highest): fields
-    (Integral, 0, _INF): "seed warmup updates_per_step freeze_actors_after",
-    (Integral, 1, _INF): "critics actors steps episodes max_episode_steps batch_size "
-                         "target_every buffer_size evaluate_every yield_every",
-    (Real, 0, 1): "gamma theta nu",
-    (Real, 0, 1e9): "sigma",
-    (Real, -1e9, 1e9): "y_min",
-    (Real, _TINY, 1): "tau noise_decay critic_lr actor_lr",
+CHOICES = dict(
+    target_rule=("max_min", "single", "paired_min", "selected", "soft"),
+    act_rule=("paired", "max_min", "first"), climbs=("own", "first"),
+    init=("independent", "tied_actors", "tied_critics"), noise=("gaussian", "ou"),
+    ends=("terminated", "none", "any_end"), backend=("numpy", "torch"),
+    dtype=("float32", "float64"))
+_ABOVE_0 = math.ulp(0.0)  # the smallest number above 0
+LIMITS = {  # (lowest, highest): fields. Whole numbers where the lowest is an int
+    (0, math.inf): "seed warmup updates_per_step freeze_actors_after",
+    (1, math.inf): "critics actors steps episodes max_episode_steps batch_size "
+                   "target_every buffer_size evaluate_every yield_every",
+    (0.0, 1.0): "gamma theta nu",
+    (0.0, 1e9): "sigma",
+    (-1e9, 1e9): "y_min",
+    (_ABOVE_0, 1.0): "tau noise_decay critic_lr actor_lr",
 }  # fmt: skip
-MAY_BE_NONE = "steps episodes max_episode_steps freeze_actors_after y_min".split()
+
+
+def _nearest(value, choices):
+    """A question with the choice that is spelled most like `value`, or no text."""
+    lower = {str(choice).lower(): choice for choice in choices}
+    near = difflib.get_close_matches(str(value).lower(), lower, n=1, cutoff=0.4)
+    return f" Did you mean {lower[near[0]]!r}?" if near else ""
+
+
+def _not_allowed(name, value, choices):
+    """The sentence for a wrong choice, with the nearest correct spelling."""
+    return (f"{name}={value!r} is not allowed: expected one of "
+            f"{', '.join(map(repr, choices))}.{_nearest(value, choices)}")
+
+
+def _number(name, value, low, high):
+    """`value` as a plain int or float. ValueError if it is not within the limits."""
+    whole = isinstance(low, int)
+    of_kind = isinstance(value, Integral if whole else Real)
+    if of_kind and not isinstance(value, bool) and low <= value <= high:
+        return int(value) if whole else float(value)
+    words = "a whole number" if whole else "a number"
+    lowest = "above 0" if low == _ABOVE_0 else f"{low:g} or more"
+    highest = "" if high == math.inf else f", at most {high:g}"
+    raise ValueError(f"{name}={value!r} is not allowed: expected {words}, "
+                     f"{lowest}{highest}.")
 
 
 @dataclass(frozen=True)
@@ -139,68 +157,51 @@ class Config:
     dtype: str = "float32"  # float32, or float64 for comparing the two agents
 
     def __post_init__(self):
-        def put(name, value):
-            object.__setattr__(self, name, value)
-
-        for name, value in zip(("critics", "actors", "algorithm"),
-                               self._algorithm(), strict=True):
-            put(name, value)
-        for name, value in PRESETS.get(self.task, _SMALL).items():
-            ended_by_episodes = name == "steps" and self.episodes is not None
-            if getattr(self, name) is None and not ended_by_episodes:
-                put(name, value)
-        if self.steps is not None and self.episodes is not None:
-            raise ValueError(f"steps={self.steps!r} and episodes={self.episodes!r}: "
-                             "give one of the two; it says when the run ends.")
-        for name, allowed in CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise ValueError(_not_allowed(name, getattr(self, name), allowed))
-        for (kind, low, high), names in RANGES.items():
+        mine = vars(self)  # the fields; written here, since `self.x = 1` is frozen
+        for (low, high), names in LIMITS.items():
             for name in names.split():
-                put(name, self._number(name, kind, low, high))
+                may_be_none = getattr(Config, name) is None  # its default
+                if not (may_be_none and mine[name] is None):
+                    mine[name] = _number(name, mine[name], low, high)
+        mine.update(self._networks())
+        for name, value in PRESETS.get(str(self.task), _SMALL).items():
+            if mine[name] is None and (name != "steps" or self.episodes is None):
+                mine[name] = value
+        if self.buffer_size is None:
+            mine["buffer_size"] = min(self.steps or MAX_REPLAY, MAX_REPLAY)
+        for name, allowed in CHOICES.items():
+            if mine[name] not in allowed:
+                raise ValueError(_not_allowed(name, mine[name], allowed))
         self._check_the_rest()
-        put("hidden", tuple(int(width) for width in self.hidden))
-        put("task_options", dict(self.task_options or {}))
+        mine["hidden"] = tuple(int(width) for width in self.hidden)
+        mine["task_options"] = dict(self.task_options or {})
 
-    def _algorithm(self):
-        """(C, K, name) from whichever of them were given."""
-        names = {numbers: name for name, numbers in ALGORITHMS.items()}
-        free_name = re.fullmatch(r"C(\d+)-K(\d+)", str(self.algorithm))
+    def _networks(self):
+        """C, K and the algorithm's name, from whichever of them were given."""
+        spelled = re.fullmatch(r"C([1-9]\d*)-K([1-9]\d*)", str(self.algorithm))
         if self.algorithm is None:
-            critics = max(2, self.actors or 0) if self.critics is None else self.critics
-            actors = min(2, critics) if self.actors is None else self.actors
-        elif free_name:
-            critics, actors = int(free_name[1]), int(free_name[2])
+            critics = self.critics or max(2, self.actors or 0)
+            actors = self.actors or min(2, critics)
+        elif spelled:
+            critics, actors = int(spelled[1]), int(spelled[2])
         elif self.algorithm in ALGORITHMS:
             critics, actors = ALGORITHMS[self.algorithm]
         else:
             raise ValueError(_not_allowed("algorithm", self.algorithm, ALGORITHMS))
-        for name, fixed in (("critics", critics), ("actors", actors)):
-            if getattr(self, name) not in (None, fixed):
-                raise ValueError(f"{name}={getattr(self, name)!r} contradicts algorithm="
-                                 f"{self.algorithm!r}, which has {fixed}. Give the name "
-                                 "or the numbers, not both.")
-        return critics, actors, names.get((critics, actors), f"C{critics}-K{actors}")
-
-    def _number(self, name, kind, low, high):
-        """The field as a plain int or float; ValueError if it is out of range."""
-        value = getattr(self, name)
-        if value is None and name == "buffer_size":
-            value = min(self.steps or MAX_REPLAY, MAX_REPLAY)
-        if value is None and name in MAY_BE_NONE:
-            return None
-        of_kind = isinstance(value, kind) and not isinstance(value, bool)
-        if not (of_kind and low <= value <= high):
-            words = "a whole number" if kind is Integral else "a number"
-            low = "above 0" if low == _TINY else f"{low} or more"
-            high = "" if high == _INF else f", at most {high}"
-            raise ValueError(f"{name}={value!r} is not allowed: expected {words}, "
-                             f"{low}{high}.")
-        return int(value) if kind is Integral else float(value)
+        if self.critics not in (None, critics) or self.actors not in (None, actors):
+            raise ValueError(f"critics={self.critics}, actors={self.actors} contradict "
+                             f"algorithm={self.algorithm!r}, which has {critics} and "
+                             f"{actors}. Give the name or the numbers, not both.")
+        names = {numbers: name for name, numbers in ALGORITHMS.items()}
+        name = names.get((critics, actors), f"C{critics}-K{actors}")
+        return dict(critics=critics, actors=actors, algorithm=name)
 
     def _check_the_rest(self):
         if not isinstance(self.task, str):
             raise ValueError(f"task={self.task!r}: expected the name of a task.")
+        if self.steps is not None and self.episodes is not None:
+            raise ValueError(f"steps={self.steps} and episodes={self.episodes}: "
+                             "give one of the two; it says when the run ends.")
         hidden = self.hidden if isinstance(self.hidden, list | tuple) else ()
         if not (hidden and all(isinstance(h, Integral) and h >= 1 for h in hidden)):
             raise ValueError(f"hidden={self.hidden!r} is not allowed: expected widths "
@@ -209,13 +210,12 @@ class Config:
             raise ValueError(f"actors={self.actors} with critics={self.critics}: actor "
                              "k climbs critic k, so expected actors <= critics.")
         if self.target_rule == "paired_min" and self.actors != self.critics:
-            raise ValueError("target_rule='paired_min' needs as many actors as critics; "
-                             f"got actors={self.actors}, critics={self.critics}.")
-        if not re.fullmatch(r"cpu|cuda(:\d+)?", str(self.device)):
-            raise ValueError(_not_allowed("device", self.device, ("cpu", "cuda")))
-        if self.backend == "numpy" and self.device != "cpu":
-            raise ValueError(f"device={self.device!r} needs backend='torch'; the NumPy "
-                             "agent runs on 'cpu'.")
+            raise ValueError("target_rule='paired_min' needs actors = critics; got "
+                             f"actors={self.actors}, critics={self.critics}.")
+        devices = "cpu" if self.backend == "numpy" else r"cpu|cuda(:\d+)?"
+        if not re.fullmatch(devices, str(self.device)):
+            raise ValueError(f"device={self.device!r} is not allowed: expected 'cpu', "
+                             "or 'cuda' with backend='torch'.")
 
     @classmethod
     def paper(cls, task="HalfCheetah-v5", algorithm="DN-DDPG", seed=0):
@@ -240,19 +240,9 @@ class Config:
         return cls(**json.loads(text))
 
 
-def _not_allowed(name, value, allowed):
-    """The sentence for a wrong choice, with the nearest correct spelling."""
-    lower = {str(choice).lower(): choice for choice in allowed}
-    near = difflib.get_close_matches(str(value).lower(), lower, n=1, cutoff=0.4)
-    hint = f" Did you mean {lower[near[0]]!r}?" if near else ""
-    return (f"{name}={value!r} is not allowed: expected one of "
-            f"{', '.join(map(repr, allowed))}.{hint}")
-
-
 # --- 2. Random numbers and files ------------------------------------------------------
 
-ROLES = ("critic", "actor", "replay", "noise", "warmup", "environment", "evaluation",
-         "keep")
+ROLES = "critic actor replay noise warmup environment evaluation keep".split()
 
 
 def stream(seed, role, index=0):
@@ -269,8 +259,7 @@ def write_npz(path, save=np.savez, **arrays):
     The file is written under another name, and takes its own name when complete.
     `save=np.savez_compressed` makes it smaller and slower.
     """
-    path = Path(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = Path(f"{path}.{os.getpid()}.part")
     try:
         with open(part, "wb") as file:
             save(file, **arrays)
@@ -294,6 +283,19 @@ def read_npz(path):
                              f"({type(error).__name__}: {error}).") from error
 
 
+def _array_to_json(array):
+    """An array, which `json` cannot write, as a dict, which it can."""
+    values = array.ravel().tolist()
+    return dict(dtype=array.dtype.name, shape=array.shape, values=values)
+
+
+def _array_from_json(found):
+    """The array that `_array_to_json` wrote; any other dict as it is."""
+    if found.keys() != {"dtype", "shape", "values"}:
+        return found
+    return np.array(found["values"], found["dtype"]).reshape(found["shape"])
+
+
 # --- 3. Replay and exploration noise --------------------------------------------------
 
 
@@ -313,8 +315,7 @@ class ReplayBuffer:
     def __init__(self, capacity, obs_dim, action_dim, rng):
         self.capacity, self.rng = capacity, rng
         shapes = (obs_dim,), (action_dim,), (), (obs_dim,), ()
-        self.arrays = Batch(*(np.zeros((capacity, *shape), np.float32)
-                              for shape in shapes))
+        self.arrays = Batch(*(np.zeros((capacity, *n), np.float32) for n in shapes))
         self.size = 0  # transitions stored, at most capacity
         self.position = 0  # row that the next transition is written to
 
@@ -335,21 +336,24 @@ class ReplayBuffer:
 
 
 class Noise:
-    """Exploration noise for one episode: Gaussian or Ornstein-Uhlenbeck (dt = 1)."""
+    """Exploration noise: Ornstein-Uhlenbeck (dt = 1), x ← x - θx + σ·N(0, 1).
+
+    With θ = 1 nothing is left of the old x: that is Gaussian noise.
+    """
 
     def __init__(self, config, action_dim, rng):
-        self.kind, self.sigma, self.theta = config.noise, config.sigma, config.theta
-        self.decay, self.scale, self.rng = config.noise_decay, 1.0, rng
-        self.x = np.zeros(action_dim)
+        self.sigma, self.rng = config.sigma, rng
+        self.theta = config.theta if config.noise == "ou" else 1.0
+        self.x, self.scale = np.zeros(action_dim), 1.0  # the scale falls by noise_decay
 
     def reset(self):
         """Start an episode: the OU noise starts from 0 again."""
-        self.x = np.zeros_like(self.x)
+        self.x[:] = 0
 
     def sample(self):
         """One draw, (A,), in units of half the action range."""
         kick = self.sigma * self.rng.standard_normal(len(self.x))
-        self.x = self.x - self.theta * self.x + kick if self.kind == "ou" else kick
+        self.x = self.x - self.theta * self.x + kick
         return self.scale * self.x
 
 
@@ -362,7 +366,7 @@ class Noise:
 def cut(flat, count, sizes):
     """Cut one flat vector into the layers of N networks: views (N, in + 1, out)."""
     layers, start = [], 0
-    for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
+    for n_in, n_out in pairwise(sizes):
         stop = start + count * (n_in + 1) * n_out
         layers.append(flat[start:stop].reshape(count, n_in + 1, n_out))
         start = stop
@@ -371,8 +375,7 @@ def cut(flat, count, sizes):
 
 def size_of(count, sizes):
     """Number of weights and biases of `count` networks with these layer sizes."""
-    return sum(count * (n_in + 1) * n_out
-               for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True))
+    return sum(count * (n_in + 1) * n_out for n_in, n_out in pairwise(sizes))
 
 
 def first_weights(layers, generators):
@@ -394,16 +397,16 @@ def join(obs, action=None):
     return x
 
 
-def forward(layers, x, scratch=None, name=""):
-    """x (..., B, in + 1) through N networks: the list [x, h1, h2, ..., z].
+def forward(layers, x, scratch=None):
+    """x (..., B, in + 1) through N networks: the list [x, h, h, ..., z].
 
     ReLU after every layer but the last; h (N, B, H + 1), z (N, B, out). `scratch`, a
-    dict, lends memory that is used again in the next update under the same `name`.
+    dict, lends the memory for every h again at the next call.
     """
     scratch = {} if scratch is None else scratch
     activations = [x]
     for i, layer in enumerate(layers[:-1]):
-        key = name, i, x.shape
+        key = "h", i, x.shape
         if key not in scratch:
             lead = np.broadcast_shapes(x.shape[:-2], layer.shape[:-2])
             scratch[key] = np.ones((*lead, x.shape[-2], layer.shape[-1] + 1), x.dtype)
@@ -414,7 +417,7 @@ def forward(layers, x, scratch=None, name=""):
     return [*activations, activations[-1] @ layers[-1]]
 
 
-def backward(layers, activations, dz, dlayers=None, inputs=None, scratch=None, name=""):
+def backward(layers, activations, dz, dlayers=None, inputs=None, scratch=None):
     """The chain rule from the last layer to the first.
 
     `dz` (N, B, out) is the loss's gradient with respect to z. With `dlayers` the
@@ -428,9 +431,9 @@ def backward(layers, activations, dz, dlayers=None, inputs=None, scratch=None, n
             np.matmul(x.swapaxes(-1, -2), dz, out=dlayers[i])
         if i == 0:
             return None if inputs is None else dz @ layer[:, inputs].swapaxes(-1, -2)
-        key = name, i, x.shape
         # With one output the product is an outer product: each number times each.
         product = np.multiply if dz.shape[-1] == 1 else np.matmul
+        key = "dh", i, x.shape
         dx = product(dz, layer.swapaxes(-1, -2), out=scratch.get(key))
         scratch[key] = dx
         dx *= x > 0  # ReLU passes a gradient where its output is positive
@@ -478,12 +481,10 @@ def td_target(reward, terminated, q_next, gamma, rule="max_min", nu=0.1, y_min=N
     `y_min` is a lower limit of y. Returns y (B,), in units of return.
     Raises ValueError for shapes that do not match and for a y that is not finite.
     """
-    if np.ndim(q_next) != 3 or not (np.shape(reward) == np.shape(terminated)
-                                    == np.shape(q_next)[2:]):
-        raise ValueError("td_target expects reward (B,), terminated (B,), q_next "
-                         f"(C, K, B); got {np.shape(reward)}, {np.shape(terminated)}, "
-                         f"{np.shape(q_next)}.")
-    reward, q_next = np.asarray(reward), np.asarray(q_next)
+    reward, ends, q_next = map(np.asarray, (reward, terminated, q_next))
+    if not (q_next.ndim == 3 and reward.shape == ends.shape == q_next.shape[2:]):
+        raise ValueError("td_target expects shapes (B,), (B,) and (C, K, B); got "
+                         f"{reward.shape}, {ends.shape} and {q_next.shape}.")
     actors = q_next.shape[1]
     lowest = q_next.min(axis=0)  # (K, B), over critics
     if rule == "max_min":
@@ -501,7 +502,7 @@ def td_target(reward, terminated, q_next, gamma, rule="max_min", nu=0.1, y_min=N
         value = (1 - nu) * lowest.max(axis=0) + nu * lowest.min(axis=0)
     else:
         raise ValueError(_not_allowed("rule", rule, CHOICES["target_rule"]))
-    y = reward + gamma * np.where(terminated, 0, value)
+    y = reward + gamma * np.where(ends, 0, value)
     if y_min is not None:
         y = np.maximum(y, y_min)
     if not np.isfinite(y).all():
@@ -531,7 +532,7 @@ def choose_actor(q, rule="paired"):
 
 
 class Agent:
-    """What the NumPy and the PyTorch agent share.
+    """What the NumPy and the PyTorch agent share: all but their arithmetic.
 
         call                   returns       meaning
         act(obs)               (A,), (B, A)  the greedy action, by config.act_rule
@@ -542,21 +543,27 @@ class Agent:
 
     Observations are (B, O), actions (B, A) in [-1, 1]; NumPy arrays in and out.
     `slow=True` asks the slow copies instead of the networks that learn.
+
+    Each agent adds the two halves of an update, `fit_critics` and `climb_critics`, and
+    what they need: `_array` and `_numpy` turn NumPy's arrays into its own and back,
+    `_prepare` follows new weights, `_out` is what networks answer.
     """
+
+    STATE = ("theta", "theta_target", "adam_m", "adam_v")  # flat: critics, then actors
 
     def __init__(self, config, obs_dim, action_dim):
         self.config, self.obs_dim, self.action_dim = config, obs_dim, action_dim
         self.dtype = np.dtype(config.dtype)
         self.critic_sizes = (obs_dim + action_dim, *config.hidden, 1)
         self.actor_sizes = (obs_dim, *config.hidden, action_dim)
-        self.split = size_of(config.critics, self.critic_sizes)  # critics, then actors
-        theta = np.empty(self.split + size_of(config.actors, self.actor_sizes))
+        self.split = size_of(config.critics, self.critic_sizes)  # where actors begin
+        self.size = self.split + size_of(config.actors, self.actor_sizes)
+        self.climbed = slice(config.actors if config.climbs == "own" else 1)  # critics
+        theta, zeros = np.empty(self.size), np.zeros(self.size)
         for role, layers in zip(("critic", "actor"), self.cut(theta), strict=True):
             tied = config.init == f"tied_{role}s"
-            generators = [stream(config.seed, role, 0 if tied else n)
-                          for n in range(len(layers[0]))]
-            first_weights(layers, generators)
-        zeros = np.zeros_like(theta)
+            first_weights(layers, [stream(config.seed, role, 0 if tied else n)
+                                   for n in range(len(layers[0]))])
         self.set_arrays(dict(theta=theta, theta_target=theta, adam_m=zeros,
                              adam_v=zeros, updates=0))
 
@@ -564,6 +571,23 @@ class Agent:
         """Views into one flat vector: (the critics' layers, the actors' layers)."""
         return (cut(theta[:self.split], self.config.critics, self.critic_sizes),
                 cut(theta[self.split:], self.config.actors, self.actor_sizes))
+
+    def arrays(self):
+        """All that learning changes, as copies: STATE, each (size,), and `updates`."""
+        state = {name: self._numpy(getattr(self, name)) for name in self.STATE}
+        return state | dict(updates=self.updates)
+
+    def set_arrays(self, arrays):
+        """Go on from the `arrays` of either agent. ValueError if shapes differ."""
+        for name in self.STATE:
+            if np.shape(arrays[name]) != (self.size,):
+                raise ValueError(f"{name} has shape {np.shape(arrays[name])}: expected "
+                                 f"({self.size},)")
+            setattr(self, name, self._array(arrays[name]))
+        self.updates = int(arrays["updates"])
+        self.critic, self.actor = self.cut(self.theta)
+        self.critic_target, self.actor_target = self.cut(self.theta_target)
+        self._prepare()
 
     def act(self, obs):
         """The greedy action, without noise: (O,) → (A,) or (B, O) → (B, A)."""
@@ -589,18 +613,45 @@ class Agent:
         next_obs = self._rows(next_obs, self.obs_dim, "next_obs")
         return self._q(next_obs, self._act(next_obs, slow=True), slow=True)
 
-    def td_target(self, batch):
-        """y (B,) of a batch, by the config's rule. No gradient flows through it."""
-        config = self.config
-        return td_target(batch.reward, batch.terminated, self.q_next(batch.next_obs),
-                         config.gamma, config.target_rule, config.nu, config.y_min)
-
     def _rows(self, array, width, name):
         array = np.atleast_2d(np.asarray(array, self.dtype))
         if array.ndim != 2 or array.shape[1] != width:
             raise ValueError(f"{name} has shape {array.shape}: expected ({width},) or "
                              f"(B, {width}).")
         return array
+
+    def _act(self, obs, slow=False):
+        layers = self.actor_target if slow else self.actor
+        return np.tanh(self._out(layers, join(obs), "act"))
+
+    def _q(self, obs, action, slow=False):
+        """Every critic at every actor's action (K, B, A): (C, K, B)."""
+        layers = self.critic_target if slow else self.critic
+        pairs = [layer[:, None] for layer in layers]  # (C, 1, in + 1, out)
+        return self._out(pairs, join(obs, action), "q")[..., 0]
+
+    def td_target(self, batch):
+        """y (B,) of a batch, by the config's rule. No gradient flows through it."""
+        config = self.config
+        return td_target(batch.reward, batch.terminated, self.q_next(batch.next_obs),
+                         config.gamma, config.target_rule, config.nu, config.y_min)
+
+    def update(self, batch, climb=True):
+        """One update: critics, then actors (if `climb`), then slow copies.
+
+        Returns the losses, "critic" (C,) and "actor" (K,): NaN without a climb.
+        """
+        config = self.config
+        batch = Batch(*(np.asarray(part, self.dtype) for part in batch))
+        self.updates += 1
+        y = self.td_target(batch)  # (B,)
+        losses = {"critic": self.fit_critics(batch, y),  # Eq. (3)
+                  "actor": np.full(config.actors, np.nan)}
+        if climb:
+            losses["actor"] = self.climb_critics(batch)  # Eq. (4)
+        if self.updates % config.target_every == 0:  # Eq. (1)
+            self.theta_target += config.tau * (self.theta - self.theta_target)
+        return losses
 
     def save(self, path):
         """Write weights, slow copies and Adam's moments to one `.npz`."""
@@ -627,73 +678,51 @@ class Agent:
 class NumpyAgent(Agent):
     """The update with gradients by hand, on flat vectors and views into them."""
 
-    def arrays(self):
-        return dict(theta=self.theta, theta_target=self.theta_target,
-                    adam_m=self.adam_m, adam_v=self.adam_v, updates=self.updates)
+    def _array(self, array):
+        return np.array(array, self.dtype)
 
-    def set_arrays(self, arrays):
-        for name in ("theta", "theta_target", "adam_m", "adam_v"):
-            setattr(self, name, np.array(arrays[name], self.dtype))
+    def _numpy(self, array):
+        return array.copy()
+
+    def _prepare(self):
         self.dtheta = np.zeros_like(self.theta)
-        self.updates = int(arrays["updates"])
-        self.scratch = {}
-        self.critic, self.actor = self.cut(self.theta)
-        self.critic_target, self.actor_target = self.cut(self.theta_target)
         self.dcritic, self.dactor = self.cut(self.dtheta)
+        self.scratch = defaultdict(dict)  # for each use, memory that is used again
 
-    def _act(self, obs, slow=False):
-        layers = self.actor_target if slow else self.actor
-        scratch = self._scratch_for(obs)
-        return np.tanh(forward(layers, join(obs), scratch, f"act {slow}")[-1])
+    def _out(self, layers, x, use):
+        again = x.shape[-2] in (1, self.config.batch_size)  # the sizes of every step
+        return forward(layers, x, self.scratch[use] if again else None)[-1]
 
-    def _q(self, obs, action, slow=False):
-        """Every critic at every actor's action (K, B, A): (C, K, B)."""
-        layers = self.critic_target if slow else self.critic
-        pairs = [layer[:, None] for layer in layers]  # (C, 1, in + 1, out)
-        scratch = self._scratch_for(obs)
-        return forward(pairs, join(obs, action), scratch, f"q {slow}")[-1][..., 0]
+    def fit_critics(self, batch, y):
+        """Critics: down the mean squared error against y (B,), Eq. (3) → losses (C,).
 
-    def _scratch_for(self, obs):
-        """Memory to use again, for the two sizes that come at every step."""
-        return self.scratch if len(obs) in (1, self.config.batch_size) else None
-
-    def update(self, batch, climb=True):
-        """One update: critics, then actors (if `climb`), then slow copies."""
-        config, K, scratch = self.config, self.config.actors, self.scratch
-        batch = Batch(*(np.asarray(part, self.dtype) for part in batch))
-        size = len(batch.reward)
-        self.updates += 1
-
-        # Critics: down the mean squared error against y, summed over critics. Eq. (3)
-        y = self.td_target(batch)  # (B,)
-        layers = forward(self.critic, join(batch.obs, batch.action), scratch, "critic")
+        What falls is the sum over critics, so that each learns as if it were alone.
+        """
+        size, scratch = len(y), self.scratch["critic"]
+        layers = forward(self.critic, join(batch.obs, batch.action), scratch)
         error = layers[-1][..., 0] - y  # (C, B)
-        backward(self.critic, layers, (2 / size) * error[..., None], self.dcritic,
-                 scratch=scratch, name="dcritic")
-        self._adam(slice(0, self.split), config.critic_lr)
-        losses = {"critic": (error * error).sum(axis=1) / size,
-                  "actor": np.full(K, np.nan)}
+        dq = (2 / size) * error[..., None]
+        backward(self.critic, layers, dq, self.dcritic, scratch=scratch)
+        self._adam(slice(0, self.split), self.config.critic_lr)
+        return (error * error).sum(axis=1) / size
 
-        # Actors: actor k up critic k, through the action a = tanh(z). Eq. (4)
-        if climb:
-            climbed = slice(0, K if config.climbs == "own" else 1)
-            critic = [layer[climbed] for layer in self.critic]
-            hidden = forward(self.actor, join(batch.obs), scratch, "actor")
-            action = np.tanh(hidden[-1])  # (K, B, A)
-            layers = forward(critic, join(batch.obs, action), scratch, "climb")
-            dq = np.full(layers[-1].shape, -1 / size, self.dtype)  # up is minus down
-            daction = backward(critic, layers, dq, inputs=slice(self.obs_dim, -1),
-                               scratch=scratch, name="dclimb")
-            daction *= 1 - action * action  # through tanh
-            backward(self.actor, hidden, daction, self.dactor, scratch=scratch,
-                     name="dactor")
-            self._adam(slice(self.split, None), config.actor_lr)
-            losses["actor"] = layers[-1][..., 0].sum(axis=1) / -size
+    def climb_critics(self, batch):
+        """Actors: actor k up critic k, through its action a = tanh(z), Eq. (4).
 
-        # Slow copies: a small step towards the networks that learn. Eq. (1)
-        if self.updates % config.target_every == 0:
-            self.theta_target += config.tau * (self.theta - self.theta_target)
-        return losses
+        Returns the losses (K,): minus the mean of Q.
+        """
+        size, scratch = len(batch.obs), self.scratch["actor"]
+        hidden = forward(self.actor, join(batch.obs), scratch)
+        action = np.tanh(hidden[-1])  # (K, B, A)
+        critic = [layer[self.climbed] for layer in self.critic]
+        layers = forward(critic, join(batch.obs, action), self.scratch["climb"])
+        dq = np.full(layers[-1].shape, -1 / size, self.dtype)  # up is minus down
+        daction = backward(critic, layers, dq, inputs=slice(self.obs_dim, -1),
+                           scratch=self.scratch["climb"])
+        daction *= 1 - action * action  # through tanh
+        backward(self.actor, hidden, daction, self.dactor, scratch=scratch)
+        self._adam(slice(self.split, None), self.config.actor_lr)
+        return layers[-1][..., 0].sum(axis=1) / -size
 
     def _adam(self, part, lr):
         adam(self.theta[part], self.dtheta[part], self.adam_m[part], self.adam_v[part],
@@ -703,105 +732,65 @@ class NumpyAgent(Agent):
 class TorchAgent(Agent):
     """The same update by autograd, on `config.device`."""
 
-    def set_arrays(self, arrays):
+    def _array(self, array):
         import torch
 
-        self.torch, self.updates = torch, int(arrays["updates"])
-        self.critic, self.actor = self._two_parts(arrays["theta"])  # flat, they learn
-        self.critic_target, self.actor_target = self._two_parts(arrays["theta_target"])
-        moments = zip(self._two_parts(arrays["adam_m"]),
-                      self._two_parts(arrays["adam_v"]), strict=True)
-        self.optimizers = []
-        for theta, lr in ((self.critic, self.config.critic_lr),
-                          (self.actor, self.config.actor_lr)):
-            adam = torch.optim.Adam([theta.requires_grad_()], lr=lr)
-            m, v = next(moments)
-            adam.state[theta] = dict(step=torch.tensor(float(self.updates)),
-                                     exp_avg=m, exp_avg_sq=v)
-            self.optimizers.append(adam)
+        self.torch, dtype = torch, getattr(torch, self.config.dtype)
+        return torch.tensor(array, dtype=dtype, device=self.config.device)
 
-    def _tensor(self, array):
-        dtype = getattr(self.torch, self.config.dtype)
-        return self.torch.tensor(array, dtype=dtype, device=self.config.device)
+    def _numpy(self, tensor):
+        return tensor.detach().cpu().numpy().copy()
 
-    def _two_parts(self, flat):
-        return self._tensor(flat[:self.split]), self._tensor(flat[self.split:])
+    def _prepare(self):
+        rates = self.config.critic_lr, self.config.actor_lr
+        parts = zip((self.critic, self.actor), self.cut(self.adam_m),
+                    self.cut(self.adam_v), rates, strict=True)
+        self.critic_adam, self.actor_adam = (self._adam(*part) for part in parts)
 
-    def arrays(self):
-        def flat(*parts):
-            return self.torch.cat(parts).detach().cpu().numpy()
+    def _adam(self, layers, m, v, lr):
+        """PyTorch's Adam on these layers, with our vectors as its moments."""
+        optimizer = self.torch.optim.Adam([x.requires_grad_() for x in layers], lr=lr)
+        for i, layer in enumerate(layers):
+            step = self.torch.tensor(float(self.updates))
+            optimizer.state[layer] = dict(step=step, exp_avg=m[i], exp_avg_sq=v[i])
+        return optimizer
 
-        critic, actor = (adam.state[theta] for adam, theta in
-                         zip(self.optimizers, (self.critic, self.actor), strict=True))
-        return dict(theta=flat(self.critic, self.actor),
-                    theta_target=flat(self.critic_target, self.actor_target),
-                    adam_m=flat(critic["exp_avg"], actor["exp_avg"]),
-                    adam_v=flat(critic["exp_avg_sq"], actor["exp_avg_sq"]),
-                    updates=self.updates)
-
-    def _critics(self, flat, x):
-        """x (..., B, O + A) through the critics: (..., B)."""
-        layers = cut(flat, self.config.critics, self.critic_sizes)
-        if x.ndim == 4:  # (1, K, B, O + A): every critic at every actor's action
-            layers = [layer[:, None] for layer in layers]
-        elif x.ndim == 3:  # (K, B, O + A): critic k, or the first, at actor k's
-            count = len(x) if self.config.climbs == "own" else 1
-            layers = [layer[:count] for layer in layers]
-        return self._forward(layers, x)[..., 0]
-
-    def _actors(self, flat, obs):
-        layers = cut(flat, self.config.actors, self.actor_sizes)
-        return self._forward(layers, obs).tanh()  # (K, B, A)
+    def _with_ones(self, x):
+        return self.torch.nn.functional.pad(x, (0, 1), value=1.0)
 
     def _forward(self, layers, x):
-        for i, layer in enumerate(layers):
-            x = x @ layer[..., :-1, :] + layer[..., -1:, :]  # the last row is the bias
-            x = x.relu() if i < len(layers) - 1 else x
-        return x
+        """x (..., B, in + 1) through N networks: z (N, B, out), as `forward`."""
+        for layer in layers[:-1]:
+            x = self._with_ones((x @ layer).relu())
+        return x @ layers[-1]
 
-    def _act(self, obs, slow=False):
+    def _out(self, layers, x, use):
         with self.torch.no_grad():
-            flat = self.actor_target if slow else self.actor
-            return self._actors(flat, self._tensor(obs)).cpu().numpy()
+            return self._numpy(self._forward(layers, self._array(x)))
 
-    def _q(self, obs, action, slow=False):
-        with self.torch.no_grad():
-            flat = self.critic_target if slow else self.critic
-            x = self._tensor(join(obs, action)[None, ..., :-1])
-            return self._critics(flat, x).cpu().numpy()  # (C, K, B)
+    def fit_critics(self, batch, y):
+        """Critics: down the mean squared error against y, Eq. (3) → losses (C,)."""
+        x = self._array(join(batch.obs, batch.action))
+        q = self._forward(self.critic, x)[..., 0]  # (C, B)
+        losses = (q - self._array(y)).square().mean(dim=1)
+        self._descend(losses.sum(), self.critic, self.critic_adam)
+        return self._numpy(losses)
 
-    def update(self, batch, climb=True):
-        """One update: critics, then actors (if `climb`), then slow copies."""
-        torch, config, K = self.torch, self.config, self.config.actors
-        batch = Batch(*(np.asarray(part, self.dtype) for part in batch))
-        obs, action = self._tensor(batch.obs), self._tensor(batch.action)
-        self.updates += 1
+    def climb_critics(self, batch):
+        """Actors: actor k up critic k, through its action, Eq. (4) → losses (K,)."""
+        obs = self._array(batch.obs)
+        action = self._forward(self.actor, self._with_ones(obs)).tanh()  # (K, B, A)
+        x = self.torch.cat((obs.expand(len(action), -1, -1), action), dim=2)
+        critic = [layer[self.climbed] for layer in self.critic]
+        losses = -self._forward(critic, self._with_ones(x))[..., 0].mean(dim=1)
+        self._descend(losses.sum(), self.actor, self.actor_adam)
+        return self._numpy(losses)
 
-        # Critics: down the mean squared error against y, summed over critics. Eq. (3)
-        y = self._tensor(self.td_target(batch))  # (B,)
-        q = self._critics(self.critic, torch.cat((obs, action), dim=1))  # (C, B)
-        critic_loss = (q - y).square().mean(dim=1)  # (C,)
-        self._descend(self.optimizers[0], critic_loss.sum(), self.critic)
-        losses = {"critic": critic_loss, "actor": torch.full((K,), torch.nan)}
-
-        # Actors: actor k up critic k, through the action. Eq. (4)
-        if climb:
-            action = self._actors(self.actor, obs)  # (K, B, A)
-            x = torch.cat((obs.expand(K, *obs.shape), action), dim=2)
-            actor_loss = -self._critics(self.critic, x).mean(dim=1)  # (K,)
-            self._descend(self.optimizers[1], actor_loss.sum(), self.actor)
-            losses["actor"] = actor_loss
-
-        # Slow copies: a small step towards the networks that learn. Eq. (1)
-        if self.updates % config.target_every == 0:
-            with torch.no_grad():
-                self.critic_target.lerp_(self.critic, config.tau)
-                self.actor_target.lerp_(self.actor, config.tau)
-        return {name: loss.detach().cpu().numpy() for name, loss in losses.items()}
-
-    def _descend(self, optimizer, loss, theta):
-        """One step of Adam on theta; no gradient is kept for anyone else's weights."""
-        (theta.grad,) = self.torch.autograd.grad(loss, theta)
+    def _descend(self, loss, layers, optimizer):
+        """One step down. No gradient is kept for anyone else's weights."""
+        gradients = self.torch.autograd.grad(loss, layers)
+        for layer, gradient in zip(layers, gradients, strict=True):
+            layer.grad = gradient
         optimizer.step()
 
 
@@ -823,6 +812,14 @@ def to_env(action, space):
     return np.minimum(np.maximum(middle + half * action, space.low), space.high)
 
 
+def _quiet_mujoco():
+    """Keep MuJoCo's note on 'settotalmass' (Humanoid, harmless) off the screen."""
+    import mujoco
+
+    mujoco.set_mju_user_warning(lambda text: "settotalmass" in str(text)
+                                or warnings.warn(str(text), stacklevel=2))
+
+
 def make_env(config, render_mode=None):
     """Make `config.task`, or refuse it with a ValueError that says why."""
     named = f"task={config.task!r}"
@@ -832,15 +829,11 @@ def make_env(config, render_mode=None):
         env = gym.make(config.task, max_episode_steps=config.max_episode_steps,
                        disable_env_checker=True, render_mode=render_mode,
                        **config.task_options)
-    except gym.error.DependencyNotInstalled as error:
-        raise ValueError(f"{named} needs a package that is missing: {error}") from error
-    except gym.error.Error as error:
-        near = difflib.get_close_matches(config.task, gym.registry, n=3, cutoff=0.5)
-        hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
-        raise ValueError(f"{named} is unknown to Gymnasium.{hint}") from error
-    except TypeError as error:
-        raise ValueError(f"{named} refuses task_options={config.task_options!r}: "
-                         f"{error}") from error
+    except (gym.error.Error, ImportError, TypeError) as error:
+        why = f"can't be made with task_options={config.task_options}: {error}"
+        if config.task.split(":")[-1] not in gym.registry:
+            why = f"is unknown to Gymnasium.{_nearest(config.task, gym.registry)}"
+        raise ValueError(f"{named} {why}") from error
     for name in ("observation_space", "action_space"):
         space = getattr(env, name)
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
@@ -850,14 +843,6 @@ def make_env(config, render_mode=None):
         raise ValueError(f"{named} has unbounded actions {env.action_space}: expected "
                          "finite bounds, since actors end in tanh.")
     return env
-
-
-def _quiet_mujoco():
-    """Keep MuJoCo's note on 'settotalmass' (Humanoid, harmless) off the screen."""
-    import mujoco
-
-    mujoco.set_mju_user_warning(lambda text: "settotalmass" in str(text)
-                                or warnings.warn(str(text), stacklevel=2))
 
 
 def simulator_state(env):
@@ -915,16 +900,15 @@ class Training:
     """
 
     def __init__(self, config):
-        self.config = config
-        self.env = make_env(config)
-        obs_dim = self.env.observation_space.shape[0]
-        self.action_dim = self.env.action_space.shape[0]
-        self.agent = make_agent(config, obs_dim, self.action_dim)
+        self.config, self.env = config, make_env(config)
+        (obs_dim,), (action_dim,) = (self.env.observation_space.shape,
+                                     self.env.action_space.shape)
+        self.agent = make_agent(config, obs_dim, action_dim)
         self.streams = {role: stream(config.seed, role) for role in
                         ("replay", "noise", "warmup", "environment", "keep")}
-        self.replay = ReplayBuffer(config.buffer_size, obs_dim, self.action_dim,
+        self.replay = ReplayBuffer(config.buffer_size, obs_dim, action_dim,
                                    self.streams["replay"])
-        self.noise = Noise(config, self.action_dim, self.streams["noise"])
+        self.noise = Noise(config, action_dim, self.streams["noise"])
         self.step = self.episode = 0
         self.keep_at = int(self.streams["keep"].integers(KEEP_EVERY))
         self.records, self.kept, self.first_losses = [], [], []
@@ -951,27 +935,29 @@ class Training:
             return next(self._loop)
 
     def _run(self):
+        config = self.config
         while not self.finished:
             seed = int(self.streams["environment"].integers(2**31))
             obs, _ = self.env.reset(seed=seed)
             self.noise.reset()
-            total, length, over = 0.0, 0, False
-            self._losses = {"critic": 0.0, "actor": 0.0, "updates": 0}
+            self._return, self._length, over = 0.0, 0, False
+            self._losses = [np.zeros(count, self.agent.dtype)  # sums
+                            for count in (config.critics, config.actors)]
+            self._updates_before = self.updates
             while not (over or self.finished):
-                obs, reward, over = self._step(obs)
-                total, length = total + reward, length + 1
-                if self.step % self.config.evaluate_every == 0:
-                    yield self._record("grid", total, length)
-                elif self.step % self.config.yield_every == 0:
-                    yield self._record("progress", total, length)
-            record = self._record("episode" if over else "progress", total, length)
+                obs, over = self._step(obs)
+                if self.step % config.evaluate_every == 0:
+                    yield self._record("grid")
+                elif self.step % config.yield_every == 0:
+                    yield self._record("progress")
+            record = self._record("episode" if over else "progress")
             self.episode += over
-            self.noise.scale *= self.noise.decay
+            self.noise.scale *= config.noise_decay
             self._remember()
             yield record
 
     def _step(self, obs):
-        """One step of the environment, then the updates. → next obs, reward, over."""
+        """One step of the environment, then the updates. → next obs, over."""
         config = self.config
         action = self._explore(obs)
         if self.step == self.keep_at:
@@ -985,84 +971,84 @@ class Training:
         over = bool(terminated or truncated)
         end = {"terminated": terminated, "none": False, "any_end": over}[config.ends]
         self._store(obs, action, reward, next_obs, end)
+        self._return += float(reward)
+        self._length += 1
         if self.step > config.warmup:
-            frozen = config.freeze_actors_after
-            climb = frozen is None or self.step <= frozen
             for _ in range(config.updates_per_step):
-                batch = self.replay.sample(config.batch_size)
-                self._note(self.agent.update(batch, climb=climb))
-        return next_obs, float(reward), over
+                self._update()
+        return next_obs, over
 
     def _explore(self, obs):
         """The action to execute, (A,): uniform at first, then greedy + noise."""
         if self.step < self.config.warmup:
-            return self.streams["warmup"].uniform(-1, 1, self.action_dim)
+            return self.streams["warmup"].uniform(-1, 1, self.agent.action_dim)
         action = self.agent.act(obs) + self.noise.sample()
         return np.minimum(np.maximum(action, -1), 1)
 
-    def _store(self, *transition):
-        """Into replay. A row that makes room is noted until the episode's end."""
-        replay, row = self.replay, self.replay.position
-        if replay.size == replay.capacity:
-            self._overwritten.append((row, [old[row].copy() for old in replay.arrays]))
-        replay.add(*transition)
-
-    def _keep(self, obs, action):
-        """Keep the simulator's state before a step that was drawn beforehand."""
-        state, xipos = simulator_state(self.env)
-        kept = dict(step=self.step, state=state, xipos=xipos,
-                    obs=np.array(obs, np.float32), action=np.array(action, np.float32))
-        self.kept = [*self.kept, kept][-KEPT:]
-        next_window = (self.step // KEEP_EVERY + 1) * KEEP_EVERY
-        self.keep_at = next_window + int(self.streams["keep"].integers(KEEP_EVERY))
-
-    def _note(self, losses):
-        self._losses["updates"] += 1
-        for name, loss in losses.items():
-            self._losses[name] = self._losses[name] + loss
+    def _update(self):
+        """One update. Losses are summed over the episode, the run's first ones kept."""
+        frozen = self.config.freeze_actors_after
+        climb = frozen is None or self.step <= frozen
+        batch = self.replay.sample(self.config.batch_size)
+        losses = self.agent.update(batch, climb=climb)
+        for total, loss in zip(self._losses, losses.values(), strict=True):
+            total += loss
         if len(self.first_losses) < FIRST_LOSSES:
-            self.first_losses = [*self.first_losses, losses["critic"]]
+            self.first_losses.append(losses["critic"])
 
-    def _record(self, kind, total, length):
-        updates = self._losses["updates"] or math.nan
-        losses = (np.full(count, self._losses[name] / updates, float)
-                  for name, count in (("critic", self.config.critics),
-                                      ("actor", self.config.actors)))
-        record = Record(kind, self.step, self.updates, self.episode, total, length,
-                        *losses)
+    def _record(self, kind):
+        updates = self.updates - self._updates_before or math.nan  # in this episode
+        losses = [(total / updates).astype(float) for total in self._losses]  # means
+        record = Record(kind, self.step, self.updates, self.episode, self._return,
+                        self._length, *losses)
         if kind != "progress":
             self.records.append(record)
         return record
 
+    def _keep(self, obs, action):
+        """Keep the simulator's state before a step that was drawn beforehand."""
+        state, xipos = simulator_state(self.env)
+        self.kept.append(dict(step=self.step, state=state, xipos=xipos,
+                              obs=np.array(obs, np.float32),
+                              action=np.array(action, np.float32)))
+        del self.kept[:-KEPT]
+        next_window = (self.step // KEEP_EVERY + 1) * KEEP_EVERY
+        self.keep_at = next_window + int(self.streams["keep"].integers(KEEP_EVERY))
+
     # Saving. At each episode's end the small things are copied. The replay memory is
-    # not: the rows overwritten since are noted, and put back in what is saved.
+    # not: its rows that are overwritten afterwards are noted, and put back in the file.
 
     def _remember(self):
         self._overwritten = []
-        self._notes = dict(
-            step=self.step, episode=self.episode, keep_at=self.keep_at, kept=self.kept,
-            noise_scale=self.noise.scale, size=self.replay.size,
-            position=self.replay.position, records=len(self.records),
-            first_losses=self.first_losses,
+        self._arrays = self.agent.arrays()
+        self._small = dict(
+            step=self.step, episode=self.episode, keep_at=self.keep_at,
+            noise_scale=self.noise.scale, records=self.records.copy(),
+            kept=self.kept.copy(), first_losses=self.first_losses.copy(),
             streams={role: rng.bit_generator.state
                      for role, rng in self.streams.items()})
-        self._weights = {name: np.copy(array)
-                         for name, array in self.agent.arrays().items()}
+
+    def _store(self, *transition):
+        """Into replay; what it overwrites is noted until the episode's end."""
+        row = self.replay.position
+        if row < self._small["step"]:  # in use when the episode began
+            old = [array[row].copy() for array in self.replay.arrays]
+            self._overwritten.append((row, old))
+        self.replay.add(*transition)
 
     def save(self, path):
         """Write the state at the last episode's end to one `.npz`, whole or not at all.
 
         At the end of the run it is the state then, even in the middle of an episode.
         """
-        notes, replay = self._notes, {}
-        for i, name in enumerate(Batch._fields):
-            replay[name] = self.replay.arrays[i][:notes["size"]].copy()
-            for row, old in reversed(self._overwritten):
-                replay[name][row] = old[i]
-        notes = notes | dict(records=self.records[:notes["records"]])
+        replay = [array[:self._small["step"]].copy() for array in self.replay.arrays]
+        for row, transition in reversed(self._overwritten):
+            for array, old in zip(replay, transition, strict=True):
+                array[row] = old
         write_npz(path, config=self.config.to_json(), obs_dim=self.agent.obs_dim,
-                  action_dim=self.action_dim, **self._weights, **replay,
-                  notes=json.dumps(notes, default=np.ndarray.tolist))
+                  action_dim=self.agent.action_dim, **self._arrays,
+                  small=json.dumps(self._small, default=_array_to_json),
+                  **dict(zip(Batch._fields, replay, strict=True)))
 
     @classmethod
     def load(cls, path):
@@ -1070,28 +1056,23 @@ class Training:
         content = read_npz(path)
         try:
             training = cls(Config.from_json(str(content["config"])))
-            training._restore(content, json.loads(str(content["notes"])))
+            training._restore(content)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} holds no training that this version can resume: "
                              f"{error}.") from error
         return training
 
-    def _restore(self, content, notes):
-        self.agent.set_arrays(content)
-        for name in ("step", "episode", "keep_at"):
-            setattr(self, name, notes[name])
-        for role, state in notes["streams"].items():
-            self.streams[role].bit_generator.state = state
-        self.noise.scale = notes["noise_scale"]
-        self.replay.size, self.replay.position = notes["size"], notes["position"]
+    def _restore(self, content):
+        small = json.loads(str(content["small"]), object_hook=_array_from_json)
+        for name in ("step", "episode", "keep_at", "kept", "first_losses"):
+            setattr(self, name, small[name])
+        self.records = [Record(*record) for record in small["records"]]
+        self.noise.scale = small["noise_scale"]
+        for role, rng in self.streams.items():
+            rng.bit_generator.state = small["streams"][role]
         for name, array in zip(Batch._fields, self.replay.arrays, strict=True):
-            array[:notes["size"]] = content[name]
-        self.records = [Record(*record[:6], *map(np.array, record[6:]))
-                        for record in notes["records"]]
-        self.first_losses = [np.array(loss, self.agent.dtype)
-                             for loss in notes["first_losses"]]
-        kinds = dict(step=int, state=np.array, obs=np.float32, action=np.float32,
-                     xipos=lambda rows: np.reshape(rows, (-1, 3)))
-        self.kept = [{name: kinds[name](value) for name, value in kept.items()}
-                     for kept in notes["kept"]]
+            array[:self.step] = content[name]
+        self.replay.size = min(self.step, self.replay.capacity)
+        self.replay.position = self.step % self.replay.capacity
+        self.agent.set_arrays(content)
         self._remember()

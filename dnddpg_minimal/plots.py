@@ -13,6 +13,16 @@ caller, who knows it, passes them.
 | `plot_filmstrip(pictures)` | a rollout in ten pictures |
 | `plot_truth(picture, path)` | the true Q over two state variables, and one path |
 | `plot_error_plane(picture)` | truth, a critic, and its error, side by side |
+| `plot_partial_sums(sums, totals)` | discounted rewards added up to a return |
+| `plot_true_q(position, action, q, lines)` | the true Q as a surface and as a map |
+| `plot_finite_differences(steps, errors)` | how a step's size spoils a slope |
+| `plot_slices(action, truth, guesses)` | Q along the action, true and guessed |
+| `plot_decay(errors)` | how fast different errors die |
+| `plot_learned_q(…)` | Q − truth as maps, and its mean over the updates |
+| `plot_hill(first, second, height, paths, top)` | J over two gains, and climbers |
+| `plot_slope_ways(gain, slope, ways)` | one slope, found in several ways |
+| `plot_actor(position, best, actors)` | an actor's actions beside the best ones |
+| `plot_price(slopes, bias, lost)` | what a critic's slope costs |
 
 The same algorithm has the same colour and the same kind of line everywhere. What is
 true is black. The colours (Okabe and Ito, 2008) are told apart by colour-blind readers.
@@ -84,6 +94,7 @@ def plot_q(curves, truth, ax=None, title=""):
     _note(ax, truth, "truth")
     _lines(ax, curves)
     ax.set(title=title, xlabel="updates", ylabel="Q")
+    ax.margins(y=0.12)
     return ax
 
 
@@ -102,6 +113,7 @@ def plot_bias(curves, predicted=None, ax=None, title=""):
         _note(ax, level, label, above=False)
     _lines(ax, curves)
     ax.set(title=title, xlabel="updates", ylabel="bias = Q − truth")
+    ax.margins(y=0.12)
     return ax
 
 
@@ -147,8 +159,8 @@ def plot_learning(records, evaluations, random=None, ax=None, title=""):
     columns = ("step", "mean", "standard_error")
     step, mean, error = np.array([[e[c] for c in columns] for e in evaluations]).T
     ax.errorbar(step, mean, 2 * error, linewidth=1.8, marker="o", markersize=4,
-                label=f"{name}, evaluated without noise, mean of "
-                      f"{evaluations[0]['n']} starts", **STYLE.get(name, {}))
+                label=f"{name} without noise, mean of {evaluations[0]['n']} starts",
+                **STYLE.get(name, {}))
     if random is not None:
         ax.axhline(random, color=GREY, linestyle=":")
         _note(ax, random, "random actions")
@@ -208,7 +220,8 @@ def plot_truth(picture, path=None, ax=None, title=""):
         broken = np.insert(path, np.flatnonzero(jumps) + 1, np.nan, axis=0)
         ax.plot(*broken.T, color="white", linewidth=3)
         ax.plot(*broken.T, color="black", linewidth=1.2)
-        marks = dict(markeredgecolor="black", markerfacecolor="white", zorder=3)
+        marks = dict(markeredgecolor="black", markerfacecolor="white", zorder=3,
+                     clip_on=False)
         ax.plot(*path[0], "o", markersize=8, **marks)
         ax.plot(*path[-1], "*", markersize=14, **marks)
     ax.set(title=title, ylabel="velocity")
@@ -259,7 +272,7 @@ def _map(ax, picture, values, colours, low=None, high=None):
 
 
 def _is_angle(x):
-    return np.allclose((x[0], x[-1]), (-np.pi, np.pi))
+    return np.allclose((x[0], x[-1]), (-np.pi, np.pi), atol=0.01)  # recorded: float16
 
 
 def _angle_ticks(ax):
@@ -296,13 +309,14 @@ def plot_true_q(position, action, q, lines, axes=None, title=""):
     position (X,), action (Y,), q (Y, X); lines: a dict from a label to actions (X,).
     """
     if axes is None:
-        figure = plt.figure(figsize=(6.6, 2.6), layout="constrained")
+        figure = plt.figure(figsize=(6, 2.3), layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
         axes = figure.add_subplot(1, 2, 1, projection="3d"), figure.add_subplot(1, 2, 2)
     hill, flat = axes
     hill.plot_surface(*np.meshgrid(position, action), q, edgecolor="white",
                       cmap=plt.get_cmap(VALUES, 12), rcount=9, ccount=9, linewidth=0.4)
-    hill.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1])
+    hill.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1], zticks=[-4, -2, 0])
+    hill.set_box_aspect(None, zoom=1.15)
     hill.tick_params(pad=-3)
     hill.grid(False)
     for axis, name in zip((hill.xaxis, hill.yaxis, hill.zaxis),
@@ -310,10 +324,8 @@ def plot_true_q(position, action, q, lines, axes=None, title=""):
         axis.set_label_text(name)
         axis.labelpad = -6
         axis.pane.set_visible(False)
-        axis.set_major_locator(plt.MaxNLocator(3))
-    flat.contourf(position, action, q, 8, cmap=VALUES, antialiased=False)
-    flat.clabel(flat.contour(position, action, q, 8, colors="white", linewidths=0.5),
-                fontsize=7)
+    image = flat.contourf(position, action, q, 8, cmap=VALUES, antialiased=False)
+    flat.figure.colorbar(image, ax=flat, label="true Q")
     for (label, actions), style in zip(lines.items(), ("-", "--")):
         flat.plot(position, actions, color="white", linewidth=3.5)
         flat.plot(position, actions, color="black", linestyle=style, label=label)
@@ -322,17 +334,17 @@ def plot_true_q(position, action, q, lines, axes=None, title=""):
     return axes
 
 
-def plot_differences(h, errors, ax=None, title=""):
-    """The error of finite differences against the step h, both on log axes.
+def plot_finite_differences(steps, errors, ax=None, title=""):
+    """The error of finite differences against their step, both on log axes.
 
-    h (N,); errors: a dict from a label to (N,), absolute errors of the slope.
+    steps (N,); errors: a dict from a label to (N,), absolute errors of the slope.
     """
     if ax is None:
         _, ax = plt.subplots(figsize=(6.4, 3), layout="constrained")
     for (label, values), style in zip(errors.items(), (ONE, TWO, THREE)):
-        ax.loglog(h, np.maximum(values, 1e-16), marker="o", markersize=3, label=label,
+        ax.loglog(steps, np.maximum(values, 1e-16), marker="o", markersize=3, label=label,
                   **style)
-    ax.set(title=title, xlabel="step h", ylabel="error of the slope")
+    ax.set(title=title, xlabel="step ε", ylabel="error of the slope")
     ax.legend(loc="lower left")
     return ax
 
@@ -385,7 +397,7 @@ def plot_learned_q(position, action, errors, curves, limit, axes=None, title="")
     updates, mean error, root mean square error (drawn for the first network only).
     """
     if axes is None:
-        figure = plt.figure(figsize=(7, 4.3), layout="constrained")
+        figure = plt.figure(figsize=(5.8, 3.6), layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
         grid = figure.add_gridspec(2, len(errors))
         axes = [figure.add_subplot(grid[0, n]) for n in range(len(errors))]
@@ -394,7 +406,7 @@ def plot_learned_q(position, action, errors, curves, limit, axes=None, title="")
         image = ax.imshow(error, origin="lower", aspect="auto", vmin=-limit, vmax=limit,
                           cmap=plt.get_cmap(ERRORS, 33), interpolation="nearest",
                           extent=(position[0], position[-1], action[0], action[-1]))
-        ax.set_title(f"after {update:,} updates", loc="center", fontsize=9)
+        ax.set_title(f"after {update} updates", loc="center", fontsize=9)
         ax.set(xlabel="position", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
     axes[0].set_ylabel("action")
     bar = axes[0].figure.colorbar(image, ax=axes[:-1], extend="both")
@@ -406,11 +418,10 @@ def plot_learned_q(position, action, errors, curves, limit, axes=None, title="")
         below.plot(updates, mean, label=label, **style)
         if n == 0:
             below.plot(updates, rms, label="root mean square error", **TWO)
-    below.axhline(0, color="black", linewidth=0.8)
+    _zero_line(below)
     for update in errors:
         below.axvline(update, color=GREY, linewidth=0.8, linestyle=":")
-    below.set(xlabel="updates", ylabel=f"Q − truth\n{SIGN}")
-    below.yaxis.label.set_size(8)
+    below.set(xlabel="updates", ylabel="Q − truth")
     below.legend(loc="upper right")
     return axes
 
@@ -422,18 +433,19 @@ def plot_hill(first, second, height, paths, top, ax=None, title=""):
     from its ring to the star `top` (2,).
     """
     if ax is None:
-        _, ax = plt.subplots(figsize=(6.2, 3.6), layout="constrained")
-    levels = height.max() - np.ptp(height) * np.linspace(0, 1, 25)[::-1] ** 2
-    image = ax.contourf(first, second, height, levels, cmap=VALUES)
-    ax.figure.colorbar(image, ax=ax, label="J (mean discounted return)", format="%.2f")
+        _, ax = plt.subplots(figsize=(5.8, 3.4), layout="constrained")
+    levels = height.max() - np.ptp(height) * np.linspace(0, 1, 13)[::-1] ** 2
+    image = ax.contourf(first, second, height, levels, cmap=VALUES, antialiased=False)
+    ax.figure.colorbar(image, ax=ax, label="J (mean discounted return)", format="%.2f",
+                       ticks=levels[::2])
     for (label, path), style in zip(paths.items(), (ONE, TWO, THREE)):
+        mark = "o" if len(path) < 20 else None  # a path of few, long steps
         ax.plot(*np.transpose(path), color="black", linewidth=3.2)
-        ax.plot(*np.transpose(path), label=label, **style)
+        ax.plot(*np.transpose(path), label=label, marker=mark, markersize=4, **style)
         ax.plot(*path[0], "o", markerfacecolor="white", markeredgecolor="black")
     ax.plot(*top, "*", markersize=15, markerfacecolor="white", markeredgecolor="black")
     ax.set(title=title, xlabel="gain of the position", ylabel="gain of the velocity")
-    if paths:
-        ax.legend(loc="upper left", frameon=True, framealpha=0.9)
+    ax.legend(loc="lower left", frameon=True)
     return ax
 
 
@@ -477,11 +489,12 @@ def plot_price(slopes, bias, lost, axes=None, title=""):
     marks; a pair of arrays (x, y) is a prediction, drawn as a black line.
     """
     if axes is None:
-        figure, axes = plt.subplots(1, 2, figsize=(8, 3.1), layout="constrained")
+        figure, axes = plt.subplots(1, 2, figsize=(6.6, 2.8), layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     marks = (("o", ONE), ("s", TWO), ("^", THREE))
+    _zero_line(axes[0])
+    axes[1].axhline(0, color=GREY, linewidth=0.8)
     for ax, series in zip(axes, (bias, lost)):
-        ax.axhline(0, color=GREY, linewidth=0.8)
         measured = iter(marks)
         for label, values in series.items():
             if isinstance(values, tuple):
@@ -491,28 +504,37 @@ def plot_price(slopes, bias, lost, axes=None, title=""):
                 ax.plot(slopes, values, marker, color=style["color"], label=label)
         ax.set_xlabel("slope m of the critic's error along the action")
         ax.legend()
-    axes[0].set(ylabel=f"critic − truth\n{SIGN}")
+    axes[0].set(ylabel="Q − truth")
+    axes[0].margins(y=0.2)
     axes[1].set(ylabel="true value lost")
     return axes
+
+
+def _zero_line(ax):
+    """The line where a critic is right, and which side of it is which."""
+    ax.axhline(0, color="black", linewidth=0.8)
+    _note(ax, 0, SIGN, above=False)
 
 
 # --- chapters 05, 06 ------------------------------------------------------------------
 
 
-def plot_one_backup(x, forms, samples, measured=None, xlabel="", ax=None, title=""):
+def plot_one_backup(x, forms, samples, measured=None, xlabel="", legend="best",
+                    ax=None, title=""):
     """The bias that one target makes: closed forms as lines, samples as marks.
 
     x (N,); forms: a dict from a label to (N,), in units of σ; samples: the same labels
     to (x, bias) of simulated errors. measured: (low, high), the range of x that was
     measured on trained critics, drawn as a grey band.
+    legend: its place, as Matplotlib's `loc`.
     """
     if ax is None:
         _, ax = plt.subplots(figsize=(6.4, 3.2), layout="constrained")
     ax.axhline(0, **TRUTH)
     if measured is not None:
         ax.axvspan(*measured, color="0.85", linewidth=0)
-        ax.annotate("measured ", (measured[0], 0.02), ha="right", va="bottom",
-                    xycoords=("data", "axes fraction"), color="0.4", fontsize=8.5)
+        ax.annotate("measured", (np.mean(measured), 0.03), ha="center", va="bottom",
+                    rotation=90, xycoords=("data", "axes fraction"), fontsize=8)
     for (label, values), style in zip(forms.items(), (ONE, TWO, THREE)):
         ax.plot(x, values, label=label, **style)
         if label in samples:
@@ -520,20 +542,20 @@ def plot_one_backup(x, forms, samples, measured=None, xlabel="", ax=None, title=
                     markeredgecolor=style["color"])
     ax.set(title=title, xlabel=xlabel, ylabel=f"bias of one target / σ\n{SIGN}")
     ax.yaxis.label.set_size(8)
-    ax.legend(loc="best")
+    ax.legend(loc=legend)
     return ax
 
 
-def plot_over_training(table, columns, log=(), axes=None, title=""):
+def plot_over_training(table, columns, log=(), limits=None, axes=None, title=""):
     """Recorded quantities during training: a thin line for each seed, their mean thick.
 
     table: a DataFrame of `load_study`, any algorithms, one row per evaluation. columns:
     a dict from a column's name to a panel's label. "bias" gets a zero line; a column
-    named in `log` a logarithmic axis. Steps at which something was not measured (NaN)
-    are passed over.
+    named in `log` a logarithmic axis; limits: a column's name to (low, high). Steps at
+    which something was not measured (NaN) are passed over.
     """
     if axes is None:
-        figure, axes = plt.subplots(1, len(columns), figsize=(7.4, 2.9), squeeze=False,
+        figure, axes = plt.subplots(1, len(columns), figsize=(6.4, 2.6), squeeze=False,
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for ax, (column, label) in zip(np.ravel(axes), columns.items()):
@@ -549,18 +571,21 @@ def plot_over_training(table, columns, log=(), axes=None, title=""):
             ax.plot(seeds.index, seeds.mean(axis=1), linewidth=2, label=name, **style,
                     zorder=3)
         ax.set(xlabel="environment steps", ylabel=label)
+        ax.yaxis.label.set_size(7.5 if column == "bias" else 9)
         if column in log:
             ax.set_yscale("log")
+        ax.set_ylim((limits or {}).get(column))
         ax.xaxis.set_major_locator(plt.MaxNLocator(4))
         _thousands(ax)
     if table.algorithm.nunique() > 1:
-        np.ravel(axes)[-1].legend(loc="best")
+        np.ravel(axes)[0].legend(loc="best", fontsize=8)
     return axes
 
 
-def _pale(colour, share=0.55):
+def _pale(colour, share=0.65):
     """The colour, mixed with white."""
-    return share * np.ones(3) + (1 - share) * np.array(plt.matplotlib.colors.to_rgb(colour))
+    rgb = np.array(plt.matplotlib.colors.to_rgb(colour))
+    return share + (1 - share) * rgb
 
 
 def plot_parts(parts, ax=None, title=""):
@@ -597,12 +622,13 @@ def plot_mean_planes(planes, limit, axes=None, title=""):
     rows, columns = len(planes), len(next(iter(planes.values())))
     if axes is None:
         figure, axes = plt.subplots(rows, columns, sharex=True, sharey=True,
-                                    figsize=(7.2, 1.6 * rows + 0.5), squeeze=False,
-                                    layout="constrained")
+                                    figsize=(1.75 * columns + 1, 1.25 * rows + 0.7),
+                                    squeeze=False, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for r, (name, pictures) in enumerate(planes.items()):
         for ax, (step, picture) in zip(axes[r], pictures.items()):
-            image = _map(ax, picture, picture["error"], ERRORS, -limit, limit)
+            shades = np.round(picture["error"] / limit * 6) / 6 * limit  # a small file
+            image = _map(ax, picture, shades, ERRORS, -limit, limit)
             mean = picture["error"].mean()
             ax.annotate(f"mean {mean:+.0f}".replace("-", "−"), (0.97, 0.04),
                         xycoords="axes fraction", ha="right", fontsize=8.5,
@@ -626,7 +652,7 @@ def plot_distance(curves, ax=None, title=""):
     curves: a dict from a label to (updates (M,), distance (M,)).
     """
     if ax is None:
-        _, ax = plt.subplots(figsize=(6.4, 3), layout="constrained")
+        _, ax = plt.subplots(figsize=(6, 2.7), layout="constrained")
     for (label, values), style in zip(curves.items(), (ONE, TWO, THREE)):
         ax.plot(*values, label=label, **style)
     ax.set(title=title, xlabel="updates", ylabel="mean |a₁ − a₂|, a in [−1, 1]")
@@ -634,11 +660,12 @@ def plot_distance(curves, ax=None, title=""):
     return ax
 
 
-def plot_differences_by_seed(differences, axes=None, title=""):
+def plot_differences_by_seed(differences, predicted=None, axes=None, title=""):
     """Paired differences: a dot for each seed, the mean, and its 95 % t interval.
 
     differences: a dict from a panel's label to a dict from a pair's name to a pair
-    (values (n,), (low, high)).
+    (values (n,), (low, high)). predicted: the same labels and names to one number, a
+    cross; a panel without a prediction may be missing.
     """
     if axes is None:
         rows = max(map(len, differences.values()))
@@ -652,8 +679,205 @@ def plot_differences_by_seed(differences, axes=None, title=""):
                     markerfacecolor="white", markeredgecolor="0.4")
             ax.plot(interval, [n, n], color="black", linewidth=1.5)
             ax.plot(np.mean(values), n, "D", color="black", markersize=6)
+        for name, value in (predicted or {}).get(label, {}).items():
+            ax.plot(value, list(pairs).index(name) - 0.2, "x", markersize=7,
+                    markeredgewidth=2, color=THREE["color"])
         ax.set_yticks(range(len(pairs)), list(pairs))
         ax.set(xlabel=label, ylim=(len(pairs) - 0.5, -0.5))
+    return axes
+
+
+# --- chapter 04 -----------------------------------------------------------------------
+
+
+def plot_targets(targets, expected=None, ax=None, title=""):
+    """How simulated targets scatter around the truth, 0: their histogram and mean.
+
+    targets (N,); expected: the closed form of their mean, or None.
+    """
+    if ax is None:
+        _, ax = plt.subplots(figsize=(4, 2.9), layout="constrained")
+    color = STYLE["DDPG"]["color"]
+    ax.hist(targets, np.linspace(-6, 8, 85), density=True, histtype="stepfilled",
+            color=color, alpha=0.45)  # one shape: quick to draw
+    ax.axvline(0, label="truth", **TRUTH)
+    ax.axvline(targets.mean(), color=color, linewidth=2.5,
+               label=f"mean {targets.mean():+.2f}")
+    if expected is not None:
+        ax.axvline(expected, color="black", linestyle=":", linewidth=1.8,
+                   label=f"closed form {expected:+.2f}")
+    ax.set(title=title, xlabel="what the target says − truth", yticks=[], xlim=(-6, 8))
+    ax.legend(loc="upper left")
+    return ax
+
+
+def plot_maximum(targets, expected, counts, curves, samples, axes=None, title=""):
+    """Eq. 5: how maxima scatter, and their mean against the number of actions.
+
+    targets (N,) and expected as in `plot_targets`. counts (M,); curves: a dict from a
+    label to the closed form (M,); samples: the same labels to simulated means (M,).
+    """
+    if axes is None:
+        figure, axes = plt.subplots(1, 2, figsize=(8, 2.9), layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    plot_targets(targets, expected, axes[0])
+    ax = axes[1]
+    ax.axhline(0, **TRUTH)
+    for (label, values), style in zip(curves.items(), (ONE, TWO, THREE)):
+        ax.plot(counts, values, label=label, **style)
+        ax.plot(counts, samples[label], "o", markersize=4.5, markerfacecolor="white",
+                markeredgecolor=style["color"])
+    ax.set(xlabel="number of actions", ylabel="mean of the maximum / σ")
+    ax.legend()
+    return axes
+
+
+def plot_growth(panels, axes=None, title=""):
+    """How a bias grows from sweep to sweep: a line for each case, its limit dotted.
+
+    panels: a dict from a panel's title to a dict from a label to (bias (N,), limit).
+    """
+    if axes is None:
+        figure, axes = plt.subplots(1, len(panels), figsize=(8, 2.9),
+                                    layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    for ax, (name, cases) in zip(axes, panels.items()):
+        for (label, (values, limit)), style in zip(cases.items(), (ONE, TWO, THREE)):
+            sweep = np.unique(np.geomspace(1, len(values), 80).astype(int))
+            ax.plot(sweep, values[sweep - 1], label=label, **style)
+            ax.axhline(limit, color="black", linestyle=":", linewidth=1.2)
+        positive = min(values.min() for values, _ in cases.values()) > 0
+        ax.set(xscale="log", yscale="log" if positive else "linear", xlabel="sweeps",
+               ylabel="Q − truth")
+        ax.set_title(name, loc="center", fontsize=9)
+        ax.legend(loc="upper left")
+    return axes
+
+
+def plot_steps(curves, points, axes=None, title=""):
+    """Two actors take one step from the same action: one panel per case.
+
+    curves: a dict from a panel's title to (action (N,), critic (N,), truth (N,)).
+    points: the same titles to (start, climbs the critic, climbs the truth): actions.
+    Dots lie on both curves, above the two actions that were reached.
+    """
+    if axes is None:
+        figure, axes = plt.subplots(1, len(curves), figsize=(8, 2.9), sharey=True,
+                                    layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    for ax, (name, (action, critic, truth)) in zip(np.ravel(axes), curves.items()):
+        ax.plot(action, truth, label="truth $Q^π$", **TRUTH | {"linewidth": 2})
+        ax.plot(action, critic, label="critic $Q_θ$", linewidth=2,
+                **STYLE["DDPG"])
+        start, *reached = points[name]
+        for label, a in zip(("approx", "true"), reached):
+            ax.axvline(a, color=GREY, linewidth=0.8, zorder=0)
+            both = [np.interp(a, action, q) for q in (critic, truth)]
+            ax.plot([a, a], both, "o", color="black", markersize=5)
+            ax.annotate(label, (a, 0.02), xycoords=("data", "axes fraction"),
+                        ha="center", fontsize=8.5,
+                        bbox=dict(facecolor="white", edgecolor="none", pad=1))
+            ax.annotate("", (a, 1), (start, 1), ("data", "axes fraction"),
+                        arrowprops=dict(arrowstyle="->", color="0.3"))
+        ax.set(xlabel="action")
+        ax.set_title(name, loc="center", fontsize=9, pad=10)
+    np.ravel(axes)[0].set_ylabel("value")
+    np.ravel(axes)[0].legend(loc="center right", bbox_to_anchor=(1, 0.72))
+    return axes
+
+
+def plot_error_and_share(pictures, limit, axes=None, title=""):
+    """Maps over the state plane at some times: the mean error, and its sign.
+
+    pictures: a dict from a step to a dict with x (N,), y (N,) and error (S, N, N) of S
+    seeds. Above: the mean over seeds; colours end at ±limit. Below: the share of seeds
+    that overestimate.
+    """
+    if axes is None:
+        figure, axes = plt.subplots(2, len(pictures), figsize=(7.4, 3.4), sharex=True,
+                                    sharey=True, layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    for n, (step, picture) in enumerate(pictures.items()):
+        error = picture["error"]
+        mean = _map(axes[0, n], picture, error.mean(axis=0), ERRORS, -limit, limit)
+        share = _map(axes[1, n], picture, 100 * (error > 0).mean(axis=0), "PuOr_r",
+                     0, 100)
+        axes[0, n].set_title(f"step {step:,}".replace(",", " "), loc="center",
+                             fontsize=9)
+        axes[0, n].set_xlabel("")
+    for row in axes:
+        row[0].set_ylabel("velocity")
+    figure = axes[0, 0].figure
+    bar = figure.colorbar(mean, ax=axes[0], extend="both")
+    bar.set_label("Q − truth\n← under   over →", fontsize=8)
+    bar = figure.colorbar(share, ax=axes[1])
+    bar.set_label("seeds that\noverestimate (%)", fontsize=8)
+    return axes
+
+
+def plot_owed(table, owed, control, axes=None, title=""):
+    """Bias during training, what is owed to lag, and a control with a frozen actor.
+
+    table: bias of recorded runs, one row per evaluation, any algorithms. owed: (step
+    (M,), bias (M,)). Left: the start of training; middle: the rest of it, each seed of
+    DDPG as a thin line. Right: control, a dict from a label to (updates (N,), bias (S,
+    N)) of S agents.
+    """
+    if axes is None:
+        figure, axes = plt.subplots(1, 3, figsize=(8, 2.8), layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    early = table.step <= 10_000
+    for ax, part in zip(axes, (table[early], table[~early])):
+        for name, runs in part.groupby("algorithm", sort=False):
+            seeds = runs.pivot(index="step", columns="seed", values="bias")
+            if name == "DDPG" and ax is axes[1]:
+                ax.plot(seeds, color="#F0B58A", linewidth=0.7)
+            ax.plot(seeds.mean(axis=1), linewidth=2, label=name, **STYLE[name])
+        at = np.isin(owed[0], part.step)
+        ax.plot(owed[0][at], owed[1][at], color="0.5", linewidth=3,
+                linestyle=(0, (1, 1)), label="owed by DDPG")
+        ax.set(xlabel="environment steps")
+        _thousands(ax)
+    axes[0].legend()
+    marks = dict(zip(control, (ONE, TWO)))
+    for label, (updates, runs) in control.items():
+        axes[2].plot(updates, np.transpose(runs), **marks[label] | {"linewidth": 0.7})
+        axes[2].plot(updates, np.mean(runs, axis=0), label=label, **marks[label])
+    axes[2].set(xlabel="further updates")
+    axes[2].legend()
+    for ax, name in zip(axes, ("first 10 000 steps", "after that", "control")):
+        ax.axhline(0, **TRUTH)
+        ax.set_title(name, loc="center", fontsize=9)
+    axes[0].set_ylabel(f"Q − truth, start states\n{SIGN}", fontsize=8)
+    return axes
+
+
+def plot_along_action(action, cases, added, axes=None, title=""):
+    """Critic and truth along the action at some states, each less its own mean.
+
+    action (N,); cases: a dict from a panel's title to (critic (N,), truth (N,)). The
+    triangles mark where each is largest. Last panel, added: a dict from a label to
+    (size (M,), true value lost (M,)) when an error of that kind is added to a critic.
+    """
+    if axes is None:
+        figure, axes = plt.subplots(1, len(cases) + 1, figsize=(8, 2.8),
+                                    layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    styles = dict(critic=STYLE["DDPG"] | {"linewidth": 2}, truth=TRUTH)
+    for ax, (name, pair) in zip(axes, cases.items()):
+        for (label, style), values in zip(styles.items(), pair):
+            level, top = values - values.mean(), values.argmax()
+            ax.plot(action, level, label=label, **style)
+            ax.plot(action[top], level[top], "v", color=style["color"], markersize=9)
+        ax.set(xlabel="action")
+        ax.set_title(name, loc="center", fontsize=9)
+    axes[0].set_ylabel("value − mean over actions")
+    axes[0].legend()
+    for (label, values), style in zip(added.items(), (TWO, ONE)):
+        axes[-1].plot(*values, marker="o", markersize=4, label=label, **style)
+    axes[-1].set(xlabel="size of the added error", ylabel="true value lost")
+    axes[-1].set_title("the same critic, made worse", loc="center", fontsize=9)
+    axes[-1].legend()
     return axes
 
 

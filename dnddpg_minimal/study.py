@@ -600,52 +600,69 @@ def study(runs, folder=RECORDINGS, scratch=None, workers=2, nice=10, scheduler=N
     folder.mkdir(parents=True, exist_ok=True)
     waiting = deque(run for run in runs if not (folder / f"{run.name}.npz").exists())
     failed, deaths, futures = {}, Counter(), {}
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(ONE_THREAD)  # for the workers: read when NumPy is loaded
-    slots = ([Cluster(scheduler)] if scheduler else
-             [Slot(nice) for _ in range(min(workers, len(waiting)))])
-    try:
-        while waiting or futures:
-            for slot in slots:
-                while waiting and slot.running < slot.room:
-                    run = waiting.popleft()
-                    future = slot.submit(_work, run, str(folder), scratch, every)
-                    futures[future] = run, slot
-                    slot.running += 1
-            ended, _ = wait(futures, timeout=1, return_when=FIRST_COMPLETED)
-            done = []
-            for future in ended:
-                run, slot = futures.pop(future)
-                slot.running -= 1
-                try:
-                    what, arrays = future.result()
-                    path = folder / f"{run.name}.npz"
-                    if arrays is not None and not path.exists():
-                        write_record(path, arrays)
-                except BrokenExecutor:
-                    slot.renew()
-                    deaths[run.name] += 1
-                    if deaths[run.name] < DEATHS:
-                        waiting.appendleft(run)
-                        continue
-                    failed[run.name] = f"its process died {DEATHS} times"
-                except Exception as error:  # whatever it is, the study goes on
-                    failed[run.name] = f"{type(error).__name__}: {error}"
-                else:
+    with one_thread():
+        slots = ([Cluster(scheduler)] if scheduler else
+                 [Slot(nice) for _ in range(min(workers, len(waiting)))])
+        try:
+            while waiting or futures:
+                for slot in slots:
+                    while waiting and slot.running < slot.room:
+                        run = waiting.popleft()
+                        future = slot.submit(_work, run, str(folder), scratch, every)
+                        futures[future] = run, slot
+                        slot.running += 1
+                done = []
+                for future in wait(futures, 1, FIRST_COMPLETED).done:
+                    run, slot = futures.pop(future)
+                    slot.running -= 1
+                    what = _outcome(future, folder / f"{run.name}.npz")
+                    if what == "died":
+                        slot.renew()
+                        deaths[run.name] += 1
+                        what = f"its process died {DEATHS} times"
+                        if deaths[run.name] < DEATHS:
+                            waiting.appendleft(run)
+                            continue
                     if what == "busy":  # done by another study: look again later
                         waiting.append(run)
                         continue
-                done.append(run.name)
-            going_on = [run for run, _ in futures.values()]
-            report(done, [Checkpoint(run, folder, scratch) for run in going_on])
-    finally:
-        for slot in slots:
-            slot.ask_to_stop()
-        for slot in slots:
-            slot.close()
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
+                    if what != "done":
+                        failed[run.name] = what
+                    done.append(run.name)
+                going_on = [run for run, _ in futures.values()]
+                report(done, [Checkpoint(run, folder, scratch) for run in going_on])
+        finally:
+            for slot in slots:
+                slot.ask_to_stop()
+            for slot in slots:
+                slot.close()
     return failed
+
+
+def _outcome(future, path):
+    """What became of a run: done, busy, died, or why it failed. Writes its record."""
+    try:
+        what, arrays = future.result()
+        if arrays is not None and not path.exists():
+            write_record(path, arrays)
+        return what
+    except BrokenExecutor:
+        return "died"
+    except Exception as error:  # whatever it is, the study goes on
+        return f"{type(error).__name__}: {error}"
+
+
+@contextmanager
+def one_thread():
+    """Processes begun inside give NumPy one thread: it reads these when loaded."""
+    before = dict(os.environ)
+    os.environ.update(ONE_THREAD)
+    try:
+        yield
+    finally:
+        for name in ONE_THREAD:
+            os.environ.pop(name, None)
+        os.environ.update((name, before[name]) for name in ONE_THREAD if name in before)
 
 
 # --- 5. Loading -----------------------------------------------------------------------
@@ -706,6 +723,9 @@ def _read(path, what, rule):
         config = meta["config"]
         one = dict(task=config["task"], algorithm=config["algorithm"],
                    variant=meta["variant"], seed=config["seed"])
+        name = "{task}/{variant}/{algorithm}-{seed}.npz".format(**one)
+        if path.parts[-3:] != Path(name).parts:
+            raise ValueError(f"it is a copy of {name}")  # and would count twice
         if what in TABLES:
             names, labels = meta[f"{what}_numbers"], meta[f"{what}_labels"]
             if not names:
@@ -961,7 +981,7 @@ def command(
     if dry_run or status:
         return tell(runs, missing, folder, scratch, timed=dry_run, workers=workers)
     try:
-        with Progress(missing) as progress:
+        with stoppable(), Progress(missing) as progress:
             failed = study(missing, folder, scratch, workers, nice, scheduler,
                            report=progress)
     except KeyboardInterrupt:
@@ -971,6 +991,18 @@ def command(
         print(f"failed: {name}: {why}", file=sys.stderr)
     print(f"{len(missing) - len(failed)} runs done, {len(failed)} failed.")
     return 1 if failed else 0
+
+
+@contextmanager
+def stoppable():
+    """Inside, Ctrl-C and a polite kill mean the same, also in the background."""
+    signals = signal.SIGINT, signal.SIGTERM
+    before = [signal.signal(one, signal.default_int_handler) for one in signals]
+    try:
+        yield
+    finally:
+        for one, handler in zip(signals, before, strict=True):
+            signal.signal(one, handler)
 
 
 class Progress:

@@ -511,7 +511,7 @@ def test_to_env_works_on_a_batch():
 
 
 def test_any_flat_task_with_bounded_actions_is_accepted():
-    env = make_env(Config("Toy-v0", task_options=dict(low=[-3, 0], high=[3, 1])))
+    env = make_env(Config(toys.TASK, task_options=dict(low=[-3, 0], high=[3, 1])))
     assert env.action_space.shape == (2,)
 
 
@@ -531,9 +531,9 @@ def test_without_a_time_limit_given_the_tasks_own_holds():
     ("Pendulum-v1:", {}, "Pendulum-v1:"),
     ("CartPole-v1", {}, "action_space Discrete.*continuous"),
     ("FrozenLake-v1", {}, "Discrete"),
-    ("Toy-v0", toys.UNBOUNDED, "unbounded"),
-    ("Toy-v0", {"obs_shape": (2, 2)}, "observation_space.*flat"),
-    ("Toy-v0", {"colour": "red"}, "task_options.*colour"),
+    (toys.TASK, toys.UNBOUNDED, "unbounded"),
+    (toys.TASK, {"obs_shape": (2, 2)}, "observation_space.*flat"),
+    (toys.TASK, {"colour": "red"}, "task_options.*colour"),
     ("Pendulum-v1", {"gravity": 3}, "task_options.*gravity"),
 ])
 def test_a_task_that_does_not_fit_is_refused_with_the_reason(task, options, words):
@@ -662,11 +662,15 @@ def test_the_first_weights_are_uniform_in_one_over_root_inputs(tmp_path):
 
 
 @AGENTS
-def test_the_critics_loss_is_the_mean_squared_td_error(kind):
-    """Eq. (3), for each critic against the one shared y."""
-    agent = tiny_agent(kind)
-    batch = random_batch(terminated=0.4)
-    y = td_target(batch.reward, batch.terminated, agent.q_next(batch.next_obs), 0.99)
+@pytest.mark.parametrize("choices", [
+    dict(gamma=0.99), dict(gamma=0.5), dict(target_rule="single"),
+    dict(target_rule="soft", nu=0.8), dict(y_min=0.3)], ids=str)
+def test_the_critics_loss_is_the_mean_squared_td_error(kind, choices):
+    """Eq. (3), for each critic against the one shared y of the config's choices."""
+    agent = tiny_agent(kind, **choices)
+    config, batch = agent.config, random_batch(terminated=0.4)
+    y = td_target(batch.reward, batch.terminated, agent.q_next(batch.next_obs),
+                  config.gamma, config.target_rule, config.nu, config.y_min)
     error = agent.q_values(batch.obs, batch.action) - y
     losses = agent.update(batch)
     np.testing.assert_allclose(losses["critic"], (error**2).mean(axis=1), rtol=1e-5)
@@ -828,7 +832,7 @@ def test_an_agents_file_holds_all_that_the_next_update_needs(kind, tmp_path):
 
 
 def test_a_trainings_file_opens_as_its_agent(tmp_path):
-    training = Training(Config("Toy-v0", steps=30, **TINY | dict(warmup=10)))
+    training = Training(Config(toys.TASK, steps=30, **TINY | dict(warmup=10)))
     list(training)
     training.save(tmp_path / "run.npz")
     obs = np.random.default_rng(0).normal(size=(5, 2))

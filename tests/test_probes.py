@@ -128,11 +128,11 @@ def test_the_critics_learn_what_the_bounded_actors_really_cost(algorithm):
 
 
 def test_pytorch_learns_a_reward_for_ever():
-    q, truth = at_replay(learned("ConstantReward", 400, backend="torch",
+    q, truth = at_replay(learned("ConstantReward", 350, backend="torch",
                                  max_episode_steps=20))
     assert abs(q - truth).max() < 0.3
 
 
 def test_pytorch_learns_a_real_end():
-    q, truth = at_replay(learned("RealEnd", 500, backend="torch", algorithm="DDPG"))
+    q, truth = at_replay(learned("RealEnd", 450, backend="torch", algorithm="DDPG"))
     assert abs(q - truth).mean() < 0.2

@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from dnddpg_minimal import ReplayBuffer, choose_actor, stream, td_target, to_env
 
-many = settings(deadline=None, derandomize=True, max_examples=50)
+many = settings(deadline=None, derandomize=True, max_examples=30)
 RULES = "max_min", "single", "paired_min", "selected", "soft"
 numbers = st.floats(-1e3, 1e3).map(lambda x: round(x, 3))
 

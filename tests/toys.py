@@ -12,6 +12,7 @@ import math
 import gymnasium as gym
 import numpy as np
 
+TASK = "Toy-v0"
 UNBOUNDED = {"low": [-math.inf], "high": [math.inf]}
 
 
@@ -50,5 +51,4 @@ class Toy(gym.Env):
         return obs, 1.0, self.length == self.ends_after, False, {}
 
 
-if "Toy-v0" not in gym.registry:
-    gym.register("Toy-v0", Toy, max_episode_steps=10)
+gym.register(TASK, Toy, max_episode_steps=10)

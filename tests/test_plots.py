@@ -1,0 +1,123 @@
+"""Figures draw what they are given, and mean the same thing everywhere."""
+
+import base64
+import json
+import re
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from dnddpg_minimal import ALGORITHMS, Record, plots
+
+NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    yield
+    plt.close("all")
+
+
+@pytest.fixture
+def picture():
+    """What `bias.plane` returns: the critic is 3 too high everywhere but one cell."""
+    x, y = np.linspace(-np.pi, np.pi, 5), np.linspace(-8, 8, 4)
+    truth = -(x**2) - y[:, None] ** 2
+    q = truth[None] + 3
+    q[0, 0, 0] -= 5
+    return dict(x=x, y=y, q=q, truth=truth)
+
+
+def test_each_algorithm_has_a_colour_and_a_kind_of_line_of_its_own():
+    assert set(plots.STYLE) == set(ALGORITHMS)
+    for part in ("color", "linestyle"):
+        assert len({style[part] for style in plots.STYLE.values()}) == len(ALGORITHMS)
+
+
+def test_an_algorithms_line_is_the_same_in_every_figure():
+    curves = {name: (np.arange(3), np.arange(3.0)) for name in ALGORITHMS}
+    records = [Record("episode", 200, 0, 0, -900.0, 200, None, None)]
+    for name in ALGORITHMS:
+        evaluation = dict(algorithm=name, step=1_000, mean=-150.0,
+                          standard_error=9.0, n=100)
+        axes = (plots.plot_q(curves, truth=2), plots.plot_bias(curves),
+                plots.plot_learning(records, [evaluation]))
+        for ax in axes:
+            (line,) = [line for line in ax.get_lines()
+                       if (line.get_color(), line.get_linestyle())
+                       == tuple(plots.STYLE[name].values())]
+            assert len(line.get_xdata()) > 0
+
+
+def test_a_fault_never_looks_like_an_algorithm():
+    assert plots.style_of("DDPG") == plots.STYLE["DDPG"]
+    assert plots.style_of("DDPG, seed 3") == plots.STYLE["DDPG"]
+    assert plots.style_of("DDPG with the wrong line") == plots.WRONG
+
+
+def test_the_truth_is_a_black_line():
+    ax = plots.plot_q({}, truth=10)
+    assert [line.get_color() for line in ax.get_lines()] == ["black"]
+
+
+def test_the_zero_line_of_a_bias_says_which_side_is_which():
+    ax = plots.plot_bias({"DDPG": (np.arange(3), np.ones(3))})
+    assert "overestimates ↑ / underestimates ↓" in [t.get_text() for t in ax.texts]
+
+
+def test_overestimation_is_red_and_underestimation_blue(picture):
+    axes = plots.plot_error_plane(picture, limit=4)
+    image = axes[2].get_images()[0]
+    over, under = image.to_rgba([3.0, -2.0])
+    assert over[0] > over[2] and under[2] > under[0]  # red, green, blue
+    assert image.get_clim() == (-4, 4)  # white is zero
+    assert np.allclose(image.get_array(), picture["q"][0] - picture["truth"])
+
+
+def test_a_path_over_the_edge_of_the_angle_is_not_drawn_through_the_picture(picture):
+    path = np.array([[3.0, 1.0], [3.3, 1.0], [3.6, 1.0]])  # passes π
+    ax = plots.plot_truth(picture, path)
+    angle = ax.get_lines()[0].get_xdata()
+    assert np.isnan(angle).sum() == 1
+    assert np.nanmax(np.abs(angle)) <= np.pi
+
+
+def test_a_filmstrip_shows_the_first_and_the_last_picture():
+    pictures = [np.full((90, 90, 3), value, np.uint8) for value in range(40)]
+    ax = plots.plot_filmstrip(pictures, count=4)
+    strip = ax.get_images()[0].get_array()
+    assert (strip[0, 0] == 0).all() and (strip[0, -1] == 39).all()
+    assert [t.get_text() for t in ax.get_xticklabels()] == ["0.0 s", "0.7 s", "1.3 s",
+                                                            "1.9 s"]
+
+
+def test_a_figure_can_be_drawn_into_axes_of_ones_own(picture):
+    figure, axes = plt.subplots(1, 3)
+    assert plots.plot_error_plane(picture, axes=axes) is axes
+    assert plots.plot_q({}, 1, ax=axes[0]) is axes[0]
+    assert plt.get_fignums() == [figure.number]
+
+
+@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("03*.ipynb")),
+                         ids=lambda path: path.stem)
+def test_the_picture_at_the_top_is_the_chapters_last_figure(path):
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    (name,) = re.findall(r"!\[.+\]\((figures/\S+\.png)\)", "".join(cells[0]["source"]))
+    figures = [output["data"]["image/png"] for cell in cells
+               for output in cell.get("outputs", [])
+               if "image/png" in output.get("data", {})]
+    last = base64.b64decode("".join(figures[-1]))
+    assert (path.parent / name).read_bytes() == last
+
+
+def test_a_notebook_that_was_never_run_has_no_last_figure(tmp_path):
+    path = tmp_path / "x.ipynb"
+    path.write_text(json.dumps({"cells": [{"cell_type": "code", "outputs": []}]}))
+    with pytest.raises(ValueError, match="run it first"):
+        plots.save_last_figure(path)
