@@ -17,6 +17,7 @@ in turn. The clock runs after the warm-up only.
 from __future__ import annotations
 
 import importlib.util
+import math
 import os
 import platform
 import statistics
@@ -54,7 +55,7 @@ def our_run(config, steps):
 
     def go_on():
         until = training.step + steps
-        while training.step < until:  # a record comes every `steps` steps, or sooner
+        while training.step < until:  # a record comes at this step, or sooner
             next(training)
         assert training.step == until
 
@@ -89,7 +90,8 @@ def contestants(task, hidden, batch_size, steps, warmup):
     def config(algorithm, backend):
         return Config(task, algorithm, hidden=hidden, batch_size=batch_size,
                       backend=backend, noise="gaussian", sigma=0.1, warmup=warmup,
-                      steps=10**9, buffer_size=CAPACITY, yield_every=steps,
+                      steps=10**9, buffer_size=CAPACITY,
+                      yield_every=math.gcd(steps, warmup),
                       evaluate_every=10**9)
 
     starts = {}
@@ -226,14 +228,16 @@ def peak():  # bytes
         return next(1024 * int(line.split()[1]) for line in file if "VmHWM" in line)
 
 stored, steps = map(int, sys.argv[1:])
-training = Training(Config("Humanoid-v5", "DN-DDPG", warmup=0, buffer_size=stored))
+training = Training(Config("Humanoid-v5", "DN-DDPG", warmup=0, buffer_size=stored,
+                           steps=2 * stored + steps))
 rng = np.random.default_rng(0)
 _, (action_dim,), _, (obs_dim,), _ = [a.shape[1:] for a in training.replay.arrays]
 for _ in range(stored):
     obs = rng.standard_normal(obs_dim, np.float32)
     training.replay.add(obs, rng.uniform(-1, 1, action_dim), 0.0, obs, False)
+training.step = stored  # as if these had been its steps
 for record in training:  # to an episode's end: what is saved is the state there
-    if record.kind == "episode" and record.step >= steps:
+    if record.kind == "episode" and record.step >= stored + steps:
         break
 print(peak())
 with tempfile.TemporaryDirectory() as folder:

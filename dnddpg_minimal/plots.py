@@ -397,14 +397,14 @@ def plot_learned_q(position, action, errors, curves, limit, axes=None, title="")
     updates, mean error, root mean square error (drawn for the first network only).
     """
     if axes is None:
-        figure = plt.figure(figsize=(5.8, 3.6), layout="constrained")
+        figure = plt.figure(figsize=(5.6, 3.5), layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
         grid = figure.add_gridspec(2, len(errors))
         axes = [figure.add_subplot(grid[0, n]) for n in range(len(errors))]
         axes += [figure.add_subplot(grid[1, :])]
     for ax, (update, error) in zip(axes, errors.items()):
         image = ax.imshow(error, origin="lower", aspect="auto", vmin=-limit, vmax=limit,
-                          cmap=plt.get_cmap(ERRORS, 33), interpolation="nearest",
+                          cmap=plt.get_cmap(ERRORS, 17), interpolation="nearest",
                           extent=(position[0], position[-1], action[0], action[-1]))
         ax.set_title(f"after {update} updates", loc="center", fontsize=9)
         ax.set(xlabel="position", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
@@ -414,13 +414,11 @@ def plot_learned_q(position, action, errors, curves, limit, axes=None, title="")
     below = axes[-1]
     for n, (updates, mean, rms) in enumerate(curves):
         style = dict(color=ONE["color"], linewidth=1.8 if n == 0 else 0.7)
-        label = {0: "mean error", 1: "mean error, other first networks"}.get(n)
+        label = {0: "mean error", 1: "mean error, other seeds"}.get(n)
         below.plot(updates, mean, label=label, **style)
         if n == 0:
-            below.plot(updates, rms, label="root mean square error", **TWO)
+            below.plot(updates, rms, label="root mean square", **TWO)
     _zero_line(below)
-    for update in errors:
-        below.axvline(update, color=GREY, linewidth=0.8, linestyle=":")
     below.set(xlabel="updates", ylabel="Q − truth")
     below.legend(loc="upper right")
     return axes
@@ -815,36 +813,41 @@ def plot_error_and_share(pictures, limit, axes=None, title=""):
     return axes
 
 
-def plot_owed(table, owed, control, axes=None, title=""):
+def plot_owed(table, owed, control, predicted, axes=None, title=""):
     """Bias during training, what is owed to lag, and a control with a frozen actor.
 
     table: bias of recorded runs, one row per evaluation, any algorithms. owed: (step
     (M,), bias (M,)). Left: the start of training; middle: the rest of it, each seed of
     DDPG as a thin line. Right: control, a dict from a label to (updates (N,), bias (S,
-    N)) of S agents.
+    N)) of S agents; predicted: (updates (M,), bias (M,)) of the frozen ones.
     """
     if axes is None:
-        figure, axes = plt.subplots(1, 3, figsize=(8, 2.8), layout="constrained")
+        figure, axes = plt.subplots(1, 3, figsize=(7.2, 2.4), layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     early = table.step <= 10_000
     for ax, part in zip(axes, (table[early], table[~early])):
         for name, runs in part.groupby("algorithm", sort=False):
             seeds = runs.pivot(index="step", columns="seed", values="bias")
             if name == "DDPG" and ax is axes[1]:
-                ax.plot(seeds, color="#F0B58A", linewidth=0.7)
+                ax.plot(seeds, color="#F0B58A", linewidth=1, antialiased=False)
             ax.plot(seeds.mean(axis=1), linewidth=2, label=name, **STYLE[name])
         at = np.isin(owed[0], part.step)
         ax.plot(owed[0][at], owed[1][at], color="0.5", linewidth=3,
                 linestyle=(0, (1, 1)), label="owed by DDPG")
         ax.set(xlabel="environment steps")
         _thousands(ax)
+    axes[0].set_xticks([0, 5_000, 10_000])
+    axes[1].set_xticks([10_000, 25_000, 40_000])
     axes[0].legend()
     marks = dict(zip(control, (ONE, TWO)))
     for label, (updates, runs) in control.items():
-        axes[2].plot(updates, np.transpose(runs), **marks[label] | {"linewidth": 0.7})
+        axes[2].plot(updates, np.transpose(runs), **marks[label] | {"linewidth": 0.8})
         axes[2].plot(updates, np.mean(runs, axis=0), label=label, **marks[label])
-    axes[2].set(xlabel="further updates")
-    axes[2].legend()
+    axes[2].plot(*predicted, label="predicted", color="black", linestyle=":")
+    axes[2].set(xlabel="further updates", xticks=[0, 1_000, 2_000])
+    axes[2].set_ylim(0, 1.5 * axes[2].get_ylim()[1])  # room for the legend
+    axes[2].legend(loc="upper right")
+    _thousands(axes[2])
     for ax, name in zip(axes, ("first 10 000 steps", "after that", "control")):
         ax.axhline(0, **TRUTH)
         ax.set_title(name, loc="center", fontsize=9)
@@ -857,7 +860,7 @@ def plot_along_action(action, cases, added, axes=None, title=""):
 
     action (N,); cases: a dict from a panel's title to (critic (N,), truth (N,)). The
     triangles mark where each is largest. Last panel, added: a dict from a label to
-    (size (M,), true value lost (M,)) when an error of that kind is added to a critic.
+    (size (M,), share of costly choices (M,), %) when such an error is added to a critic.
     """
     if axes is None:
         figure, axes = plt.subplots(1, len(cases) + 1, figsize=(8, 2.8),
@@ -875,8 +878,8 @@ def plot_along_action(action, cases, added, axes=None, title=""):
     axes[0].legend()
     for (label, values), style in zip(added.items(), (TWO, ONE)):
         axes[-1].plot(*values, marker="o", markersize=4, label=label, **style)
-    axes[-1].set(xlabel="size of the added error", ylabel="true value lost")
-    axes[-1].set_title("the same critic, made worse", loc="center", fontsize=9)
+    axes[-1].set(xlabel="size of the added error", ylim=0)
+    axes[-1].set_title("costly choices (% of states)", loc="center", fontsize=9)
     axes[-1].legend()
     return axes
 

@@ -3,6 +3,8 @@
 | call | shows |
 |---|---|
 | `maximisation_laboratory(...)` | the bias of one target, chapters 04 to 06 |
+| `error_plane_explorer()` | a recorded agent on Pendulum: its error, state by state |
+| `live_training(config)` | a run in front of a class: start, pause, stop |
 
 A panel is sliders, one line of text, and one picture. The text says what the picture
 shows, since a picture has no words for a screen reader. Every slider has its name as a
@@ -12,6 +14,7 @@ and of its picture, so that a notebook with a panel in it can still be tested.
 
 import io
 import math
+import threading
 
 import ipywidgets
 import numpy as np
@@ -19,7 +22,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dnddpg_minimal import bias, plots
-from dnddpg_minimal.dnddpg import stream, td_target
+from dnddpg_minimal.dnddpg import ALGORITHMS, Config, Training, stream, td_target
 
 
 class Panel(ipywidgets.VBox):
@@ -161,10 +164,189 @@ def maximisation_laboratory(sliders=("actors", "sigma", "rho"), rule="max_min",
         formula = closed_form(rule=rule, **now)
         ax = figure.add_axes((0.02, 0.16, 0.96, 0.8))
         plots.plot_targets(targets, formula, ax)
-        known = "none known here" if formula is None else f"{formula:+.2f}"
+        known = ("none known here" if formula is None
+                 else f"{round(formula, 2) + 0.0:+.2f}")  # no "−0.00"
         return (f"Bias of one target: simulated {targets.mean():+.2f}, "
                 f"closed form {known}. Truth 0.")
 
     moving = {name: slider(LABORATORY[name][0], usual[name], *LABORATORY[name][1:])
               for name in sliders}
     return panel("the maximisation laboratory", moving, draw)
+
+
+# --- The error-plane explorer: Pendulum, recorded agents ------------------------------
+
+
+def error_plane_explorer(folder=None):
+    """Look at one recorded agent on Pendulum: its error plane, one state, its rollout.
+
+    Choose algorithm, seed and time; choose a state by angle and velocity. The text
+    gives every critic's Q there and the truth: the discounted sum of the rollout that
+    is drawn. `folder` holds recordings, by default those of the package; seeds with
+    recorded weights can be chosen. FileNotFoundError if there is none.
+    """
+    from dnddpg_minimal.study import load_agent_at, load_study
+
+    def by_run(what):
+        runs = load_study("Pendulum-v1", what=what, folder=folder)
+        return {(run["algorithm"], run["seed"]): run for run in runs}
+
+    planes, weights = by_run("planes"), by_run("weights")
+    if not weights:
+        raise FileNotFoundError("no recorded weights of Pendulum: record them with "
+                                "python -m dnddpg_minimal study --task Pendulum-v1")
+    algorithms = [name for name in ALGORITHMS if any(run[0] == name for run in weights)]
+    seeds = sorted({seed for _, seed in weights})
+    times = [int(step) for step in next(iter(weights.values()))["step"]]
+    world = bias.dynamics(Config("Pendulum-v1"))
+    agents = {}  # made when first looked at
+
+    def draw(figure, algorithm, seed, step, angle, velocity):
+        run, i = (algorithm, seed), times.index(step)
+        if run not in weights or run not in planes:
+            return f"{algorithm}, seed {seed}: not recorded."
+        if (run, i) not in agents:
+            agents[run, i] = load_agent_at(weights[run], i)
+        agent, plane = agents[run, i], planes[run]
+        state = np.array([[angle, velocity]])
+        path, truth = follow(world, agent, state)
+        obs = world.observe(state)
+        q = agent.q_values(obs, agent.act(obs))[:, 0]  # (C,)
+        left, right = figure.subplots(1, 2, width_ratios=(1, 1.2), gridspec_kw=dict(
+            left=0.08, right=0.98, bottom=0.2, top=0.88, wspace=0.42))
+        error = plane["q"][i].min(axis=0) - plane["truth"][i]
+        limit = max(np.quantile(np.abs(error), 0.95), 1.0)
+        picture = dict(x=plane["x"], y=plane["y"])
+        image = plots._map(left, picture, error, plots.ERRORS, -limit, limit)
+        left.plot(angle, velocity, "o", color="black", markerfacecolor="white")
+        left.set(ylabel="velocity", title="min Q − truth")
+        figure.colorbar(image, ax=left).set_label("← under   over →", fontsize=8)
+        right.plot(np.cos(path[:, 0]), **plots.STYLE[algorithm])
+        right.set(ylim=(-1.1, 1.1), xlabel="step of the rollout",
+                  title="height: 1 is upright, −1 hangs")
+        critics = ", ".join(f"Q{c + 1} {value:.1f}" for c, value in enumerate(q))
+        return (f"{algorithm}, seed {seed}, step {step:,}: {critics}; truth "
+                f"{truth:.1f}; min Q − truth {q.min() - truth:+.1f}.")
+
+    def choice(kind, label, options, value):
+        return kind(options=options, value=value, description=label,
+                    style={"description_width": "18em"},
+                    layout=ipywidgets.Layout(width="38em"))
+
+    controls = {
+        "algorithm": choice(ipywidgets.Dropdown, "algorithm", algorithms,
+                            algorithms[0]),
+        "seed": choice(ipywidgets.SelectionSlider, "seed", seeds, seeds[0]),
+        "step": choice(ipywidgets.SelectionSlider, "environment step", times,
+                       times[-1]),
+        "angle": slider("angle (0 is upright), rad", 3.0, -3.1, 3.1, 0.1),
+        "velocity": slider("velocity, rad/s", 0.0, -8.0, 8.0, 0.5),
+    }
+    return panel("the error-plane explorer", controls, draw, size=(7.4, 2.7))
+
+
+def follow(world, agent, state, steps=500, shown=150):
+    """One rollout from state (1, S): its first `shown` states, and its truth."""
+    path, truth = [], 0.0
+    for t in range(steps):
+        if t < shown:
+            path.append(state[0])
+        state, reward, _ = world.step(state, agent.act(world.observe(state)))
+        truth += agent.config.gamma**t * reward[0]
+    return np.array(path), truth
+
+
+# --- The live training panel ----------------------------------------------------------
+
+
+class LiveTraining(Panel):
+    """Train in front of a class: start, pause, stop; progress, return and bias.
+
+    The loop runs in a thread of its own, so that the buttons are heard. Nothing starts
+    by itself. After a stop, or at the end, `training` holds the Training; start begins
+    a new run of the same config, with the same numbers.
+    """
+
+    def __init__(self, config):
+        self.config, self.training, self._thread = config, None, None
+        self.title = f"live training of {config.algorithm} on {config.task}"
+        self._go, self._stop = threading.Event(), threading.Event()
+        buttons = [ipywidgets.Button(description=name, tooltip=f"{name} the training")
+                   for name in ("start", "pause", "stop")]
+        self.start_button, self.pause_button, self.stop_button = buttons
+        for button, act in zip(buttons, (self.start, self.pause, self.stop),
+                               strict=True):
+            button.on_click(lambda _, act=act: act())
+        self.progress = ipywidgets.IntProgress(max=config.steps, description="steps")
+        self.text = ipywidgets.Label("Press start.")
+        self.picture = ipywidgets.Image(format="png")
+        self._figure = Figure(figsize=(7.4, 2.7), dpi=90)
+        self._canvas = FigureCanvasAgg(self._figure)
+        super().__init__([ipywidgets.HBox(buttons), self.progress, self.text,
+                          self.picture])
+
+    def start(self):
+        """Begin a run, or go on after a pause."""
+        self._go.set()
+        self.pause_button.description = "pause"
+        if self._thread is None or not self._thread.is_alive():
+            self._stop.clear()
+            self._thread = threading.Thread(target=self._work, daemon=True)
+            self._thread.start()
+
+    def pause(self):
+        """Wait after the next record; once more: go on."""
+        if self._go.is_set():
+            self._go.clear()
+            self.pause_button.description = "go on"
+        else:
+            self.start()
+
+    def stop(self):
+        """End the run after the next record."""
+        self._stop.set()
+        self._go.set()
+
+    def _work(self):
+        try:
+            self.training, found = Training(self.config), []
+            for record in self.training:
+                self.progress.value = record.step
+                if record.kind == "episode":
+                    self.text.value = (f"Step {record.step:,}: the last episode, with "
+                                       f"noise, returned {record.episode_return:.0f}.")
+                if record.kind == "grid":
+                    found.append(bias.evaluate(self.training))
+                    self._draw(found)
+                while not self._go.wait(0.1):
+                    pass
+                if self._stop.is_set():
+                    break
+            self.text.value = f"Over at step {self.training.step:,}. " + self.text.value
+        except Exception as error:  # a thread's error would be seen by nobody
+            self.text.value = f"The run broke off: {error}"
+
+    def _draw(self, found):
+        step = [measured.evaluation["step"] for measured in found]
+        rows = [next((row for row in measured.bias if row["action"] == "policy"
+                      and row["critic"] == "min"), {"bias": math.nan})
+                for measured in found]
+        style = plots.STYLE.get(self.config.algorithm, {})
+        self._figure.clear()
+        left, right = self._figure.subplots(1, 2)
+        left.plot(step, [m.evaluation["mean"] for m in found], marker="o", **style)
+        left.set(title="return, without noise", xlabel="environment steps")
+        right.axhline(0, color="black", linewidth=1)
+        right.plot(step, [row["bias"] for row in rows], marker="o", **style)
+        right.set(title="min Q − truth", xlabel="environment steps")
+        right.set_ylabel(plots.SIGN, fontsize=7)
+        right.set_yscale("symlog", linthresh=30)
+        self._figure.tight_layout()
+        file = io.BytesIO()
+        self._canvas.print_png(file)
+        self.picture.value = file.getvalue()
+
+
+def live_training(config=None):
+    """The live training panel for a Config, by default DN-DDPG on Pendulum."""
+    return LiveTraining(Config(steps=20_000) if config is None else config)

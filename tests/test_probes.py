@@ -53,7 +53,7 @@ def test_the_truths_by_hand():
 @ALL_THREE
 def test_a_reward_of_1_for_ever_is_worth_1_over_1_minus_gamma(algorithm):
     """The time limit of 20 steps is no end: a critic that stopped there learns less."""
-    q, truth = at_replay(learned("ConstantReward", 400, algorithm,
+    q, truth = at_replay(learned("ConstantReward", 350, algorithm,
                                  max_episode_steps=20))
     assert truth[0] == pytest.approx(2)
     assert abs(q - truth).max() < 0.25
@@ -61,7 +61,7 @@ def test_a_reward_of_1_for_ever_is_worth_1_over_1_minus_gamma(algorithm):
 
 def test_the_probe_catches_a_time_limit_taken_for_an_end():
     """One end in two steps: Q = 1 + gamma Q / 2, which is 4/3 instead of 2."""
-    q, truth = at_replay(learned("ConstantReward", 400, "DDPG", max_episode_steps=2,
+    q, truth = at_replay(learned("ConstantReward", 350, "DDPG", max_episode_steps=2,
                                  ends="any_end"))
     assert abs(q - 4 / 3).mean() < 0.2
 
@@ -84,7 +84,7 @@ def test_the_probe_catches_a_bootstrap_through_a_real_end():
 
 @ALL_THREE
 def test_the_critics_read_the_reward_from_the_observation(algorithm):
-    training = learned("ObservedReward", 600, algorithm)
+    training = learned("ObservedReward", 500, algorithm)
     q, truth = at_replay(training)
     assert abs(q.mean(axis=1) - truth.mean()).max() < 0.25
     low, high = training.agent.q_values([[0.0], [1.0]], [[0.0], [0.0]]).T
@@ -93,7 +93,7 @@ def test_the_critics_read_the_reward_from_the_observation(algorithm):
 
 @ALL_THREE
 def test_a_reward_one_step_later_is_discounted_once_and_the_actor_finds_it(algorithm):
-    training = learned("TwoSteps", 800, algorithm)
+    training = learned("TwoSteps", 650, algorithm)
     q, truth = at_replay(training)
     assert truth.std() > 0.2
     assert (abs(q - truth).mean(axis=1) < 0.08).all()
@@ -107,7 +107,7 @@ def test_the_critics_learn_what_the_bounded_actors_really_cost(algorithm):
 
     The closed form is for the best policy, so it bounds the truth from above.
     """
-    agent = learned("LinearQuadratic", 800, algorithm, max_episode_steps=20).agent
+    agent = learned("LinearQuadratic", 650, algorithm, max_episode_steps=20).agent
     task, rng = probes.LinearQuadratic, np.random.default_rng(0)
     states, first = task.start_states(rng, 200), rng.uniform(-1, 1, (200, 1))
     truth, now, action = np.zeros(200), states, first

@@ -25,8 +25,8 @@ from dnddpg_minimal import (
 )
 
 SMALL = dict(hidden=(8, 8), batch_size=8)
-PENDULUM = SMALL | dict(task="Pendulum-v1", steps=260, warmup=60, max_episode_steps=40,
-                        evaluate_every=50, yield_every=30, seed=3)
+PENDULUM = SMALL | dict(task="Pendulum-v1", steps=130, warmup=30, max_episode_steps=20,
+                        evaluate_every=25, yield_every=15, seed=3)
 
 
 def run(**choices):
@@ -37,7 +37,7 @@ def run(**choices):
 
 @cache
 def standard_run():
-    """260 steps: six episodes of 40 and one of 20 that the run's end cuts off."""
+    """130 steps: six episodes of 20 and one of 10 that the run's end cuts off."""
     return run()
 
 
@@ -72,7 +72,7 @@ def assert_same_run(first, second, tmp_path):
 
 @pytest.mark.parametrize("backend", ["numpy", "torch"])
 def test_the_same_seed_gives_the_same_history(backend, tmp_path):
-    (first, told), (second, told_again) = (run(backend=backend, steps=150)
+    (first, told), (second, told_again) = (run(backend=backend, steps=80)
                                            for _ in range(2))
     assert_same_records(told, told_again)
     assert_same_run(first, second, tmp_path)
@@ -107,22 +107,22 @@ def test_looking_at_the_agent_on_the_way_changes_nothing():
 def test_an_episode_record_comes_at_each_episodes_end():
     _, told = standard_run()
     episodes = [record for record in told if record.kind == "episode"]
-    assert [record.step for record in episodes] == [40, 80, 120, 160, 200, 240]
+    assert [record.step for record in episodes] == [20, 40, 60, 80, 100, 120]
     assert [record.episode for record in episodes] == [0, 1, 2, 3, 4, 5]
-    assert {record.length for record in episodes} == {40}
+    assert {record.length for record in episodes} == {20}
 
 
 def test_grid_records_lie_on_the_grid_and_progress_in_between():
     _, told = standard_run()
-    for kind, steps in dict(grid=[50, 100, 150, 200, 250],
-                            progress=[30, 60, 90, 120, 180, 210, 240, 260]).items():
+    for kind, steps in dict(grid=[25, 50, 75, 100, 125],
+                            progress=[15, 30, 45, 60, 90, 105, 120, 130]).items():
         assert [record.step for record in told if record.kind == kind] == steps
     assert {record.kind for record in told} == {"episode", "grid", "progress"}
     assert [record.step for record in told] == sorted(record.step for record in told)
 
 
 def test_a_grid_record_comes_before_the_episode_record_of_its_step():
-    kinds = [record.kind for record in standard_run()[1] if record.step == 200]
+    kinds = [record.kind for record in standard_run()[1] if record.step == 100]
     assert kinds == ["grid", "episode"]
 
 
@@ -158,7 +158,7 @@ def test_a_record_tells_the_mean_losses_of_its_episode(monkeypatch):
     assert np.isnan(first.critic_loss).all() and np.isnan(first.actor_loss).all()
     assert first.critic_loss.shape == first.actor_loss.shape == (2,)
     record, losses = second
-    assert len(losses) == 20  # the warm-up lasted into the second episode
+    assert len(losses) == 10  # the warm-up lasted into the second episode
     for name in ("critic", "actor"):
         mean = np.mean([np.float64(loss[name]) for loss in losses], axis=0)
         np.testing.assert_allclose(getattr(record, f"{name}_loss"), mean, rtol=1e-5)
@@ -166,8 +166,8 @@ def test_a_record_tells_the_mean_losses_of_its_episode(monkeypatch):
 
 def test_steps_are_exact_and_the_iterator_stays_at_its_end():
     training, told = standard_run()
-    assert training.finished and training.step == told[-1].step == 260
-    assert len(training.replay.arrays.reward) == training.replay.size == 260
+    assert training.finished and training.step == told[-1].step == 130
+    assert len(training.replay.arrays.reward) == training.replay.size == 130
     with pytest.raises(StopIteration):
         next(training)
 
@@ -198,8 +198,8 @@ def test_with_episodes_given_the_grid_is_still_one_of_steps():
 def test_warm_up_makes_no_update():
     training, told = standard_run()
     for record in told:
-        assert record.updates == max(0, record.step - 60)
-    assert training.updates == 200
+        assert record.updates == max(0, record.step - 30)
+    assert training.updates == 100
 
 
 def test_updates_per_step_are_counted():
@@ -208,7 +208,7 @@ def test_updates_per_step_are_counted():
 
 
 def test_a_run_that_is_all_warm_up_learns_nothing():
-    training, _ = run(warmup=260)
+    training, _ = run(warmup=130)
     start = NumpyAgent(training.config, 3, 1)
     obs = np.ones((2, 3))
     np.testing.assert_array_equal(training.agent.actions(obs), start.actions(obs))
@@ -248,10 +248,10 @@ def test_the_greedy_action_gets_noise_of_size_sigma():
 
 
 def test_noise_decays_from_episode_to_episode():
-    training, _ = run(steps=120, warmup=0, freeze_actors_after=0, updates_per_step=0,
+    training, _ = run(steps=60, warmup=0, freeze_actors_after=0, updates_per_step=0,
                       noise_decay=1e-3, sigma=0.5, act_rule="first")
     stored = training.replay.arrays
-    noise = abs(stored.action - training.agent.act(stored.obs)).reshape(3, 40)
+    noise = abs(stored.action - training.agent.act(stored.obs)).reshape(3, 20)
     assert noise[0].mean() > 0.1
     assert 1e-5 < noise[1].mean() < 1e-3 and noise[2].mean() < 2e-6
 
@@ -275,22 +275,22 @@ def test_replay_holds_the_transitions_in_order():
 
 
 def test_freeze_actors_after_keeps_the_actors_and_lets_the_critics_learn():
-    training = Training(Config(**PENDULUM, freeze_actors_after=150))
+    training = Training(Config(**PENDULUM, freeze_actors_after=75))
     obs, action = np.ones((4, 3)), np.zeros((4, 1))
     actions, qs = {}, {}
     for record in training:
         actions[record.step] = training.agent.actions(obs)
         qs[record.step] = training.agent.q_values(obs, action)
-    assert (actions[120] != actions[150]).all()
-    for step in (160, 200, 260):
-        np.testing.assert_array_equal(actions[step], actions[150])
-        assert (qs[step] != qs[150]).all()
-    collected = training.replay.arrays.action[150:]
+    assert (actions[60] != actions[75]).all()
+    for step in (80, 100, 130):
+        np.testing.assert_array_equal(actions[step], actions[75])
+        assert (qs[step] != qs[75]).all()
+    collected = training.replay.arrays.action[75:]
     assert abs(np.diff(collected[:, 0])).min() > 0  # noise goes on
 
 
 def test_frozen_actors_slow_copies_come_to_rest_on_them():
-    training, _ = run(freeze_actors_after=100, tau=0.3)
+    training, _ = run(freeze_actors_after=60, tau=0.3)
     obs = np.ones((4, 3))
     np.testing.assert_allclose(training.agent.actions(obs, slow=True),
                                training.agent.actions(obs), atol=1e-5)
@@ -414,18 +414,18 @@ def resumed(training, save_at, path):
 
 
 RESUMES = {
-    "at an episode's end": (dict(), 120),
-    "in the middle of an episode": (dict(), 150),
-    "in the first episode": (dict(), 30),
-    "in the warm-up": (dict(warmup=130), 100),
-    "with a replay that wraps": (dict(buffer_size=70), 180),
-    "with a replay shorter than an episode": (dict(buffer_size=17), 210),
-    "with OU noise that fades": (dict(noise="ou", noise_decay=0.8), 150),
-    "with episodes for an end": (dict(steps=None, episodes=6), 150),
-    "with one critic": (dict(algorithm="DDPG"), 150),
-    "with slow copies that move rarely": (dict(target_every=7), 150),
-    "with frozen actors": (dict(freeze_actors_after=110), 150),
-    "with PyTorch": (dict(backend="torch", steps=150), 90),
+    "at an episode's end": (dict(), 60),
+    "in the middle of an episode": (dict(), 75),
+    "in the first episode": (dict(), 15),
+    "in the warm-up": (dict(warmup=65), 50),
+    "with a replay that wraps": (dict(buffer_size=35), 90),
+    "with a replay shorter than an episode": (dict(buffer_size=9), 75),
+    "with OU noise that fades": (dict(noise="ou", noise_decay=0.8), 75),
+    "with episodes for an end": (dict(steps=None, episodes=6), 75),
+    "with one critic": (dict(algorithm="DDPG"), 75),
+    "with slow copies that move rarely": (dict(target_every=7), 75),
+    "with frozen actors": (dict(freeze_actors_after=55), 75),
+    "with PyTorch": (dict(backend="torch", steps=80), 50),
 }
 
 
@@ -442,29 +442,29 @@ def test_a_saved_run_goes_on_as_if_never_stopped(what, tmp_path):
 def test_what_resumes_is_the_last_episodes_end(tmp_path):
     training = Training(Config(**PENDULUM))
     for record in training:
-        if record.step == 150:
+        if record.step == 75:
             break
     training.save(tmp_path / "run.npz")
     again = Training.load(tmp_path / "run.npz")
-    assert (again.step, again.episode, again.updates) == (120, 3, 60)
-    assert [r.step for r in again.records if r.kind == "episode"] == [40, 80, 120]
+    assert (again.step, again.episode, again.updates) == (60, 3, 30)
+    assert [r.step for r in again.records if r.kind == "episode"] == [20, 40, 60]
     assert_same_records(again.records, training.records[:len(again.records)])
 
 
 def test_saving_does_not_disturb_the_run_that_goes_on(tmp_path):
-    training, told = Training(Config(**PENDULUM | dict(buffer_size=17))), []
+    training, told = Training(Config(**PENDULUM | dict(buffer_size=9))), []
     for record in training:
         training.save(tmp_path / "run.npz")
         told.append(record)
-    whole, others = run(buffer_size=17)
+    whole, others = run(buffer_size=9)
     assert_same_records(told, others)
     assert_same_run(training, whole, tmp_path)
 
 
 def test_a_run_may_be_resumed_again_and_again(tmp_path):
     path = tmp_path / "run.npz"
-    whole, _ = run(buffer_size=50)
-    training = Training(Config(**PENDULUM | dict(buffer_size=50)))
+    whole, _ = run(buffer_size=25)
+    training = Training(Config(**PENDULUM | dict(buffer_size=25)))
     while not training.finished:  # one episode, then a new life
         for record in training:
             if record.kind == "episode":
@@ -493,8 +493,9 @@ def test_a_run_saved_before_its_first_step_starts_there(tmp_path):
 
 
 def test_kept_states_and_first_losses_survive(tmp_path):
-    whole, _ = run(steps=400)
-    again, _ = resumed(Training(Config(**PENDULUM | dict(steps=400))), 330,
+    choices = dict(steps=400, warmup=350)
+    whole, _ = run(**choices)
+    again, _ = resumed(Training(Config(**PENDULUM | choices)), 390,
                        tmp_path / "run.npz")
     assert len(whole.kept) in (2, 3) and len(whole.first_losses) == 20
     for one, other in zip(whole.kept, again.kept, strict=True):
@@ -530,7 +531,7 @@ KILLED = {
 
 @pytest.mark.parametrize("task", KILLED)
 def test_a_run_killed_at_a_random_moment_goes_on_as_if_never_killed(task, tmp_path):
-    config = Config(task, seed=6, steps=360, warmup=50, buffer_size=100, **SMALL,
+    config = Config(task, seed=6, steps=300, warmup=50, buffer_size=70, **SMALL,
                     yield_every=3, evaluate_every=50, **KILLED[task])
     path = tmp_path / "run.npz"
     child = subprocess.Popen([sys.executable, "-c", CHILD, config.to_json(), str(path)],
@@ -544,7 +545,7 @@ def test_a_run_killed_at_a_random_moment_goes_on_as_if_never_killed(task, tmp_pa
         child.kill()  # SIGKILL: nothing can be tidied up
         child.communicate()
     again = Training.load(path)
-    assert 0 < again.step < 360
+    assert 0 < again.step < 300
     list(again)
     whole = Training(config)
     list(whole)

@@ -1,0 +1,78 @@
+"""The panels: what a control does, without a browser."""
+
+import time
+
+import pytest
+
+from dnddpg_minimal import Config, widgets
+from dnddpg_minimal.study import load_study
+
+
+def wait_until(holds, seconds=60):
+    end = time.monotonic() + seconds
+    while not holds() and time.monotonic() < end:
+        time.sleep(0.02)
+    assert holds()
+
+
+def test_the_laboratory_shows_the_closed_form_and_follows_its_sliders():
+    panel = widgets.maximisation_laboratory(actors=2)
+    actors, sigma, _, text, picture = panel.children
+    assert "+0.56" in text.value  # 1/sqrt(pi): two actions, one critic
+    before = picture.value
+    sigma.value = 2.0
+    assert "+1.13" in text.value
+    assert picture.value != before
+    actors.value = 1
+    assert "closed form +0.00" in text.value
+
+
+def test_the_laboratory_refuses_a_quantity_that_it_does_not_have():
+    with pytest.raises(ValueError, match="gamma"):
+        widgets.maximisation_laboratory(gamma=0.9)
+
+
+def test_every_control_of_the_explorer_changes_text_and_picture():
+    if not load_study("Pendulum-v1", what="weights"):
+        pytest.skip("no weights of Pendulum are recorded")
+    panel = widgets.error_plane_explorer()
+    *controls, text, picture = panel.children
+    for control, value in zip(controls, ("DN-DDPG", 1, 4_000, 1.0, 4.0), strict=True):
+        before = text.value, picture.value
+        control.value = value
+        assert text.value != before[0]
+        assert picture.value != before[1]
+        assert control.description
+    assert "DN-DDPG, seed 1, step 4,000" in text.value
+
+
+def test_the_explorer_says_where_recordings_are_missing(tmp_path):
+    with pytest.raises(FileNotFoundError, match="study"):
+        widgets.error_plane_explorer(folder=tmp_path)
+
+
+def test_live_training_starts_only_when_asked_and_pauses_and_stops():
+    config = Config("Pendulum-v1", "DDPG", steps=100_000, warmup=100, hidden=(16, 16),
+                    yield_every=20)
+    panel = widgets.live_training(config)
+    assert panel.training is None
+    assert panel.text.value == "Press start."
+    panel.start_button.click()
+    wait_until(lambda: panel.progress.value > 200)
+    panel.pause_button.click()
+    time.sleep(0.5)  # the step that was under way
+    paused_at = panel.progress.value
+    time.sleep(0.5)
+    assert panel.progress.value == paused_at
+    panel.pause_button.click()  # go on
+    wait_until(lambda: panel.progress.value > paused_at)
+    panel.stop_button.click()
+    wait_until(lambda: "Over at step" in panel.text.value)
+    assert 0 < panel.training.step < config.steps
+
+
+def test_a_run_that_breaks_off_says_so_in_the_panel():
+    panel = widgets.live_training(Config("NoSuchTask-v0", steps=100))
+    panel.start_button.click()
+    wait_until(lambda: "broke off" in panel.text.value)
+    assert "NoSuchTask-v0" in panel.text.value
