@@ -342,8 +342,8 @@ def plot_finite_differences(steps, errors, ax=None, title=""):
     if ax is None:
         _, ax = plt.subplots(figsize=(6.4, 3), layout="constrained")
     for (label, values), style in zip(errors.items(), (ONE, TWO, THREE)):
-        ax.loglog(steps, np.maximum(values, 1e-16), marker="o", markersize=3, label=label,
-                  **style)
+        ax.loglog(steps, np.maximum(values, 1e-16), marker="o", markersize=3,
+                  label=label, **style)
     ax.set(title=title, xlabel="step ε", ylabel="error of the slope")
     ax.legend(loc="lower left")
     return ax
@@ -553,7 +553,7 @@ def plot_over_training(table, columns, log=(), limits=None, axes=None, title="")
     which something was not measured (NaN) are passed over.
     """
     if axes is None:
-        figure, axes = plt.subplots(1, len(columns), figsize=(6.4, 2.6), squeeze=False,
+        figure, axes = plt.subplots(1, len(columns), figsize=(6.2, 2.5), squeeze=False,
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for ax, (column, label) in zip(np.ravel(axes), columns.items()):
@@ -576,7 +576,7 @@ def plot_over_training(table, columns, log=(), limits=None, axes=None, title="")
         ax.xaxis.set_major_locator(plt.MaxNLocator(4))
         _thousands(ax)
     if table.algorithm.nunique() > 1:
-        np.ravel(axes)[0].legend(loc="best", fontsize=8)
+        np.ravel(axes)[-1].legend(loc="best", fontsize=8)
     return axes
 
 
@@ -620,12 +620,13 @@ def plot_mean_planes(planes, limit, axes=None, title=""):
     rows, columns = len(planes), len(next(iter(planes.values())))
     if axes is None:
         figure, axes = plt.subplots(rows, columns, sharex=True, sharey=True,
-                                    figsize=(1.75 * columns + 1, 1.25 * rows + 0.7),
+                                    figsize=(1.6 * columns + 1, 1.2 * rows + 0.7),
                                     squeeze=False, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for r, (name, pictures) in enumerate(planes.items()):
         for ax, (step, picture) in zip(axes[r], pictures.items()):
-            shades = np.round(picture["error"] / limit * 6) / 6 * limit  # a small file
+            # Few shades, a small file; none is white, so that the sign is always seen.
+            shades = (np.floor(picture["error"] / limit * 5) + 0.5) / 5 * limit
             image = _map(ax, picture, shades, ERRORS, -limit, limit)
             mean = picture["error"].mean()
             ax.annotate(f"mean {mean:+.0f}".replace("-", "−"), (0.97, 0.04),
@@ -736,7 +737,7 @@ def plot_growth(panels, axes=None, title=""):
     panels: a dict from a panel's title to a dict from a label to (bias (N,), limit).
     """
     if axes is None:
-        figure, axes = plt.subplots(1, len(panels), figsize=(8, 2.9),
+        figure, axes = plt.subplots(1, len(panels), figsize=(7.4, 2.7),
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for ax, (name, cases) in zip(axes, panels.items()):
@@ -792,8 +793,8 @@ def plot_error_and_share(pictures, limit, axes=None, title=""):
     that overestimate.
     """
     if axes is None:
-        figure, axes = plt.subplots(2, len(pictures), figsize=(7.4, 3.4), sharex=True,
-                                    sharey=True, layout="constrained")
+        figure, axes = plt.subplots(2, len(pictures), figsize=(7, 3.2), sharex=True,
+                                    sharey=True, layout="constrained", dpi=75)
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for n, (step, picture) in enumerate(pictures.items()):
         error = picture["error"]
@@ -803,6 +804,7 @@ def plot_error_and_share(pictures, limit, axes=None, title=""):
         axes[0, n].set_title(f"step {step:,}".replace(",", " "), loc="center",
                              fontsize=9)
         axes[0, n].set_xlabel("")
+        axes[1, n].set_xlabel("" if n else "angle (0 is upright)")
     for row in axes:
         row[0].set_ylabel("velocity")
     figure = axes[0, 0].figure
@@ -816,42 +818,44 @@ def plot_error_and_share(pictures, limit, axes=None, title=""):
 def plot_owed(table, owed, control, predicted, axes=None, title=""):
     """Bias during training, what is owed to lag, and a control with a frozen actor.
 
-    table: bias of recorded runs, one row per evaluation, any algorithms. owed: (step
-    (M,), bias (M,)). Left: the start of training; middle: the rest of it, each seed of
-    DDPG as a thin line. Right: control, a dict from a label to (updates (N,), bias (S,
-    N)) of S agents; predicted: (updates (M,), bias (M,)) of the frozen ones.
+    table: bias of recorded runs, one row per evaluation, any algorithms; each seed of
+    DDPG is a thin line. owed: (step (M,), bias (M,)) of DDPG. The scale is linear up to
+    ±40 and logarithmic beyond. Right: control, a dict from a label to (updates (N,),
+    bias (S, N)) of S agents, one dot each; predicted: (updates (M,), bias (M,)) of the
+    frozen ones.
     """
     if axes is None:
-        figure, axes = plt.subplots(1, 3, figsize=(7.2, 2.4), layout="constrained")
+        figure, axes = plt.subplots(1, 2, figsize=(7.2, 2.7), layout="constrained",
+                                    width_ratios=(3, 2), dpi=75)  # a small file
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    early = table.step <= 10_000
-    for ax, part in zip(axes, (table[early], table[~early])):
-        for name, runs in part.groupby("algorithm", sort=False):
-            seeds = runs.pivot(index="step", columns="seed", values="bias")
-            if name == "DDPG" and ax is axes[1]:
-                ax.plot(seeds, color="#F0B58A", linewidth=1, antialiased=False)
-            ax.plot(seeds.mean(axis=1), linewidth=2, label=name, **STYLE[name])
-        at = np.isin(owed[0], part.step)
-        ax.plot(owed[0][at], owed[1][at], color="0.5", linewidth=3,
-                linestyle=(0, (1, 1)), label="owed by DDPG")
-        ax.set(xlabel="environment steps")
-        _thousands(ax)
-    axes[0].set_xticks([0, 5_000, 10_000])
-    axes[1].set_xticks([10_000, 25_000, 40_000])
-    axes[0].legend()
-    marks = dict(zip(control, (ONE, TWO)))
-    for label, (updates, runs) in control.items():
-        axes[2].plot(updates, np.transpose(runs), **marks[label] | {"linewidth": 0.8})
-        axes[2].plot(updates, np.mean(runs, axis=0), label=label, **marks[label])
-    axes[2].plot(*predicted, label="predicted", color="black", linestyle=":")
-    axes[2].set(xlabel="further updates", xticks=[0, 1_000, 2_000])
-    axes[2].set_ylim(0, 1.5 * axes[2].get_ylim()[1])  # room for the legend
-    axes[2].legend(loc="upper right")
-    _thousands(axes[2])
-    for ax, name in zip(axes, ("first 10 000 steps", "after that", "control")):
+    ax, right = axes
+    for name, runs in table.groupby("algorithm", sort=False):
+        seeds = runs.pivot(index="step", columns="seed", values="bias")
+        if name == "DDPG":
+            ax.plot(seeds, color="#F0B58A", linewidth=0.8, antialiased=False)
+        ax.plot(seeds.mean(axis=1), linewidth=2, label=name, **STYLE[name])
+    ax.plot(*owed, color="0.5", linewidth=3, linestyle=(0, (1, 1)),
+            label="owed by DDPG")
+    ax.set_yscale("symlog", linthresh=40, linscale=2)
+    ticks = [-40, -20, 0, 20, 40, 600]
+    ax.set_yticks(ticks, [f"{tick:+d}".replace("-", "−") for tick in ticks])
+    ax.set_yticks([], minor=True)
+    ax.set(xlabel="environment steps", xticks=[0, 20_000, 40_000], ylim=(-45, 9_000))
+    ax.set_ylabel(f"Q − truth, start states\n{SIGN}", fontsize=8)
+    ax.legend(loc="upper right", ncols=2)
+
+    for (label, (updates, runs)), style in zip(control.items(), (ONE, TWO)):
+        right.plot(updates, np.transpose(runs), "o", markersize=4,
+                   markerfacecolor="white", markeredgecolor=style["color"])
+        right.plot(updates, np.mean(runs, axis=0), label=label, **style)
+    right.plot(*predicted, label="predicted", color="black", linestyle=":")
+    right.set(xlabel="further updates", xticks=[0, 1_000, 2_000])
+    right.set_ylim(-5, 1.6 * right.get_ylim()[1])  # room for the legend
+    right.legend(loc="upper right")
+    for ax, name in zip(axes, ("training", "control")):
         ax.axhline(0, **TRUTH)
+        _thousands(ax)
         ax.set_title(name, loc="center", fontsize=9)
-    axes[0].set_ylabel(f"Q − truth, start states\n{SIGN}", fontsize=8)
     return axes
 
 
@@ -860,10 +864,10 @@ def plot_along_action(action, cases, added, axes=None, title=""):
 
     action (N,); cases: a dict from a panel's title to (critic (N,), truth (N,)). The
     triangles mark where each is largest. Last panel, added: a dict from a label to
-    (size (M,), share of costly choices (M,), %) when such an error is added to a critic.
+    (size (M,), share of costly choices (M,), %) when that error is added to a critic.
     """
     if axes is None:
-        figure, axes = plt.subplots(1, len(cases) + 1, figsize=(8, 2.8),
+        figure, axes = plt.subplots(1, len(cases) + 1, figsize=(7.6, 2.7),
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     styles = dict(critic=STYLE["DDPG"] | {"linewidth": 2}, truth=TRUTH)
