@@ -742,14 +742,14 @@ def plot_growth(panels, axes=None, title=""):
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for ax, (name, cases) in zip(axes, panels.items()):
         for (label, (values, limit)), style in zip(cases.items(), (ONE, TWO, THREE)):
-            sweep = np.unique(np.geomspace(1, len(values), 80).astype(int))
+            sweep = np.unique(np.geomspace(1, len(values), 50).astype(int))
             ax.plot(sweep, values[sweep - 1], label=label, **style)
             ax.axhline(limit, color="black", linestyle=":", linewidth=1.2)
         positive = min(values.min() for values, _ in cases.values()) > 0
         ax.set(xscale="log", yscale="log" if positive else "linear", xlabel="sweeps",
                ylabel="Q − truth")
         ax.set_title(name, loc="center", fontsize=9)
-        ax.legend(loc="upper left")
+        ax.legend(loc="upper left" if positive else "lower right")
     return axes
 
 
@@ -884,7 +884,7 @@ def plot_along_action(action, cases, added, axes=None, title=""):
         axes[-1].plot(*values, marker="o", markersize=4, label=label, **style)
     axes[-1].set(xlabel="size of the added error", ylim=0)
     axes[-1].set_title("costly choices (% of states)", loc="center", fontsize=9)
-    axes[-1].legend()
+    axes[-1].legend(loc="center right")
     return axes
 
 
