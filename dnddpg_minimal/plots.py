@@ -884,7 +884,7 @@ def plot_along_action(action, cases, added, axes=None, title=""):
         axes[-1].plot(*values, marker="o", markersize=4, label=label, **style)
     axes[-1].set(xlabel="size of the added error", ylim=0)
     axes[-1].set_title("costly choices (% of states)", loc="center", fontsize=9)
-    axes[-1].legend(loc="center right")
+    axes[-1].legend(loc="lower right")
     return axes
 
 

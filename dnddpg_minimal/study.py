@@ -488,9 +488,12 @@ def processor():
 
 
 def blas():
-    """The kernels that multiply matrices here: other ones round otherwise."""
+    """The kernels that multiply NumPy's matrices: other ones round otherwise."""
+    found = [one for one in threadpool_info() if one["user_api"] == "blas"]
+    # SciPy may bring its own, which is there or not by what was imported before
+    own = [one for one in found if "numpy" in one["filepath"]] or found
     return [f"{one['internal_api']} {one['version']} {one.get('architecture')}"
-            for one in threadpool_info() if one["user_api"] == "blas"]
+            for one in own]
 
 
 @cache

@@ -150,12 +150,16 @@ def test_a_batch_has_the_size_asked_for_however_little_is_stored(capacity, added
 
 
 @many
-@given(st.floats(-1e6, 1e6, width=32), st.floats(0.0009765625, 1e6, width=32),
-       arrays(np.float32, (4, 1), elements=st.floats(-1, 1, width=32)))
-def test_no_rounding_carries_an_action_out_of_its_bounds(low, width, action):
-    space = Box(np.float32([low]), np.float32([low + width]))
-    executed = to_env(action, space)
-    assert (executed >= space.low).all() and (executed <= space.high).all()
-    ends = to_env(np.float32([[-1], [1]]), space)
-    np.testing.assert_allclose(ends[:, 0], [space.low[0], space.high[0]],
-                               rtol=1e-5, atol=1e-5 * float(width))
+@given(st.integers(0, 10**6), st.floats(-100, 100), st.floats(1e-3, 100))
+def test_no_rounding_carries_an_action_out_of_its_bounds(seed, shift, width):
+    """Two thousand dimensions at once, each with bounds of its own."""
+    rng = np.random.default_rng(seed)
+    low = (shift + rng.normal(size=2_000)).astype(np.float32)
+    high = (low + width * rng.uniform(0.1, 1, 2_000)).astype(np.float32)
+    space = Box(low, high)
+    for end, bound in ((-1, low), (1, high)):
+        executed = to_env(np.full((1, 2_000), end, np.float32), space)[0]
+        assert (executed >= low).all() and (executed <= high).all()
+        np.testing.assert_allclose(executed, bound, rtol=1e-4, atol=1e-4)
+    between = to_env(rng.uniform(-1, 1, (1, 2_000)), space)[0]
+    assert (between >= low).all() and (between <= high).all()

@@ -21,6 +21,7 @@ from dnddpg_minimal import (
     Record,
     Training,
     read_npz,
+    stream,
     write_npz,
 )
 
@@ -287,6 +288,8 @@ def test_freeze_actors_after_keeps_the_actors_and_lets_the_critics_learn():
         assert (qs[step] != qs[75]).all()
     collected = training.replay.arrays.action[75:]
     assert abs(np.diff(collected[:, 0])).min() > 0  # noise goes on
+    until_then, _ = run(steps=75)
+    np.testing.assert_array_equal(actions[75], until_then.agent.actions(obs))
 
 
 def test_frozen_actors_slow_copies_come_to_rest_on_them():
@@ -361,6 +364,7 @@ def test_which_steps_are_kept_is_drawn_from_the_seed_alone():
         for choices in (dict(algorithm="DDPG"), dict(algorithm="DN-DDPG", sigma=0.9),
                         dict(seed=9)))
     assert first == second != third
+    assert first[0] == stream(3, "keep").integers(156)
 
 
 # --- what a task must not return ------------------------------------------------------
