@@ -155,14 +155,15 @@ def test_a_record_tells_the_mean_losses_of_its_episode(monkeypatch):
         if record.kind == "episode":
             told.append((record, losses))
             losses = []
-    first, second = told[0][0], told[1]
+    first = told[0][0]
     assert np.isnan(first.critic_loss).all() and np.isnan(first.actor_loss).all()
     assert first.critic_loss.shape == first.actor_loss.shape == (2,)
-    record, losses = second
-    assert len(losses) == 10  # the warm-up lasted into the second episode
-    for name in ("critic", "actor"):
-        mean = np.mean([np.float64(loss[name]) for loss in losses], axis=0)
-        np.testing.assert_allclose(getattr(record, f"{name}_loss"), mean, rtol=1e-5)
+    counts = [len(losses) for _, losses in told]
+    assert counts == [0, 10, 20, 20, 20, 20]  # the warm-up lasted into the second
+    for record, losses in told[1:]:
+        for name in ("critic", "actor"):
+            mean = np.mean([np.float64(loss[name]) for loss in losses], axis=0)
+            np.testing.assert_allclose(getattr(record, f"{name}_loss"), mean, rtol=1e-5)
 
 
 def test_steps_are_exact_and_the_iterator_stays_at_its_end():
@@ -239,13 +240,14 @@ def test_actions_are_clipped_after_the_noise_and_stored_as_executed():
 
 
 def test_the_greedy_action_gets_noise_of_size_sigma():
-    training, _ = run(steps=1_000, warmup=0, freeze_actors_after=0, sigma=0.2,
-                      act_rule="first", updates_per_step=0)
+    training, _ = toy_run(steps=1_000, warmup=0, updates_per_step=0, sigma=0.2,
+                          task_options=dict(low=[-3, 0], high=[3, 10]))
     stored = training.replay.arrays
     noise = stored.action - training.agent.act(stored.obs)
-    free = abs(stored.action) < 1
-    assert free.mean() > 0.9
-    assert abs(noise[free].std() - 0.2) < 0.03
+    free = (abs(stored.action) < 1).all(axis=1)
+    assert free.mean() > 0.8
+    np.testing.assert_allclose(noise[free].std(axis=0), 0.2, atol=0.04)
+    assert abs(np.corrcoef(noise[free].T)[0, 1]) < 0.15  # each dimension has its own
 
 
 def test_noise_decays_from_episode_to_episode():
@@ -497,7 +499,7 @@ def test_a_run_saved_before_its_first_step_starts_there(tmp_path):
 
 
 def test_kept_states_and_first_losses_survive(tmp_path):
-    choices = dict(steps=400, warmup=350)
+    choices = dict(steps=400, warmup=373)  # saved at 380, with 7 losses of 20
     whole, _ = run(**choices)
     again, _ = resumed(Training(Config(**PENDULUM | choices)), 390,
                        tmp_path / "run.npz")
