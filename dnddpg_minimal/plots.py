@@ -29,13 +29,13 @@ caller, who knows it, passes them.
 | `plot_steps(curves, points)` | two actors' steps on a true and a learned Q |
 | `plot_error_and_share(pictures, limit)` | mean error planes, share of seeds above 0 |
 | `plot_owed(table, owed, control, predicted)` | bias, what lag owes, frozen actors |
-| `plot_along_action(action, cases, added)` | errors along the action: offset and slope |
-| `plot_one_backup(x, forms, samples)` | closed forms of one target's bias, and samples |
+| `plot_along_action(action, cases, added)` | error along the action: offset and slope |
+| `plot_one_backup(x, forms, samples)` | closed forms of one target, and samples |
 | `plot_over_training(table, columns)` | measured quantities over the steps, by seed |
 | `plot_parts(parts)` | a bias taken apart into two sums |
 | `plot_mean_planes(planes, limit)` | mean error planes of several algorithms |
 | `plot_distance(curves)` | how far apart two actors' actions are |
-| `plot_differences_by_seed(differences)` | paired differences, their mean and interval |
+| `plot_differences_by_seed(differences)` | paired differences, mean and interval |
 
 The same algorithm has the same colour and the same kind of line everywhere. What is
 true is black. The colours (Okabe and Ito, 2008) are told apart by colour-blind readers.
