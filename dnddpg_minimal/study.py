@@ -156,6 +156,7 @@ def _class():
     # Controls: networks as many weights as DN's, twice the updates, frozen actors
     runs += _many(10, pendulum, ddpg, "hidden=92-92", hidden=(92, 92))
     runs += _many(10, pendulum, dcn, "updates_per_step=2", updates_per_step=2)
+    runs += _many(10, pendulum, ALGORITHMS, "frozen", freeze_actors_after=20_000)
     runs += _many(1, (*cheetah, *hopper), ALGORITHMS, "frozen", **frozen)
     runs += _many(1, (*walker, *humanoid), dn, "frozen", **frozen)
     # Chapters 03 and 12
