@@ -24,13 +24,16 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from dnddpg_minimal.dnddpg import Config, NumpyAgent, Training, make_env, to_env
+from dnddpg_minimal.dnddpg import Config, NumpyAgent, Training, make_env
+from dnddpg_minimal.films import (
+    FILM_LENGTH,
+    check_display,
+    make_camera_env,
+    play,
+    write_film,
+)
 
 SAVE_EVERY = 120  # seconds between two checkpoints
-FILM_LENGTH = 200  # pictures at most
-FILM_WIDTH = 300  # pixels at most
-FILM_COLOURS = 32
-SHORTEST_PICTURE = 20  # milliseconds; viewers slow down a film that is faster
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ended
 
 
@@ -163,74 +166,6 @@ def watch(
         print(f"The film: {film}")
     env.close()
     return 0
-
-
-def play(agent, env, seed):
-    """One episode of the greedy policy from one start; yields each step's reward."""
-    obs, _ = env.reset(seed=seed)
-    over = False
-    while not over:
-        action = to_env(agent.act(obs), env.action_space)
-        obs, reward, terminated, truncated, _ = env.step(action)
-        over = terminated or truncated
-        yield float(reward)
-
-
-def write_film(path, pictures, seconds):
-    """Write a GIF of the pictures, each (height, width, 3) uint8, with one palette.
-
-    seconds: how long each picture stays.
-    """
-    from PIL import Image
-
-    small = [Image.fromarray(picture) for picture in pictures]
-    for image in small:
-        image.thumbnail((FILM_WIDTH, FILM_WIDTH))
-    samples = small[:: math.ceil(len(small) / 10)]
-    width, height = small[0].size
-    strip = Image.new("RGB", (width, height * len(samples)))
-    for row, image in enumerate(samples):
-        strip.paste(image, (0, row * height))
-    palette = strip.quantize(FILM_COLOURS)
-    none = Image.Dither.NONE  # dithering flickers, and does not compress
-    first, *rest = [image.quantize(palette=palette, dither=none) for image in small]
-    milliseconds = max(SHORTEST_PICTURE, round(1000 * seconds))
-    first.save(path, save_all=True, append_images=rest, duration=milliseconds, loop=0)
-
-
-def make_camera_env(config):
-    """An environment that draws without a window. ValueError if that can't be done."""
-    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # before pygame is imported
-    if not has_display():
-        os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported
-    try:
-        env = make_env(config, render_mode="rgb_array")
-        if hasattr(env.unwrapped, "model"):  # MuJoCo on a CPU: 4 times as fast without
-            quality = env.unwrapped.model.vis.quality  # fine shadows and fine edges,
-            quality.shadowsize, quality.offsamples = 512, 0  # and shrinking smooths too
-        env.reset(seed=0)
-        if env.render() is None:
-            raise ValueError(f"task={config.task!r} draws no pictures")
-    except ValueError:
-        raise
-    except Exception as error:  # each library has its own for "no graphics here"
-        sys.unraisablehook = lambda _: None  # half-made viewers fail again when deleted
-        raise ValueError(
-            f"no picture of {config.task!r} can be made here ({error}). Without a "
-            "display MuJoCo needs EGL (Debian: libegl1, libgl1-mesa-dri).") from error
-    return env
-
-
-def has_display():
-    """False on a Linux that has no screen to open a window on."""
-    return sys.platform != "linux" or bool(
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def check_display():
-    if not has_display():
-        raise ValueError("there is no display to open a window on: "
-                         "write a film instead, with --film FILE.gif")
 
 
 # --- the commands ---------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The recorded study: which runs there are, doing them, resuming them, loading them.
+"""The recorded study: which runs there are, doing them, resuming them.
 
 A run is a `Config`, a `variant` that names what is special about it, and perhaps one of
 the faulty trainings of bugs.py. Its record is one small file, written whole or not at
@@ -14,13 +14,10 @@ started again, it goes on where it was, bit for bit.
 | `list_of("quick")`, `"class"`, `"paper"` | the runs of a budget, in order of doing |
 | `record(run, folder)` | do one run, write its record |
 | `study(runs, folder, ...)` | do those that are missing, on processes or a cluster |
-| `load_study(task, algorithm, ...)` | what was recorded, as tables and arrays |
-| `score(table, column)` | one number per run: the mean of its last evaluations |
-| `load_agent_at(weights, i)` | an agent from recorded weights |
-| `film(task, algorithm, ...)` | a GIF and a PNG of a recorded agent |
 
-`python -m dnddpg_minimal study --help` is the command; recordings/README.md says how to
-use it on one machine and on several.
+What was recorded is loaded by records.py; its `load_study`, `score` and `load_agent_at`
+can be imported from here too. `python -m dnddpg_minimal study --help` is the command;
+recordings/README.md says how to use it on one machine and on several.
 """
 
 import gc
@@ -34,7 +31,6 @@ import subprocess
 import sys
 import threading
 import time
-import warnings
 from collections import Counter, deque
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -59,22 +55,28 @@ from dnddpg_minimal.dnddpg import (
     MUJOCO_TASKS,
     Config,
     Training,
-    make_agent,
     read_npz,
     write_npz,
 )
+from dnddpg_minimal.records import (
+    BINS,
+    FILMED,
+    FORMAT,
+    PLANES,
+    RECORDINGS,
+    SMALL,
+    TASKS,
+    load_agent_at,
+    load_study,
+    score,
+    write_readme,
+)
 
-FORMAT = 1  # of a record
-RECORDINGS = Path(__file__).parent / "recordings"
-SMALL = ("Pendulum-v1", "ArmEasy-v0", "ArmHard-v0")
-TASKS = (*SMALL, "MountainCarContinuous-v0", *MUJOCO_TASKS)  # small ones first
+__all__ = ["Run", "list_of", "load_agent_at", "load_study", "record", "score", "study"]
+
 CHECKPOINT_EVERY = 75  # seconds, then at the next episode's end
 PROBE_STEP = 2_000  # a test repeats a run so far, and compares the weights
 PICTURES_AT = (0.1, 0.25, 0.5, 1.0)  # of the steps: planes and weights
-FILMED = [f"{task}/class/DN-DDPG-0" for task in TASKS]  # agents with a film
-FILMED += [f"{task}/class/{algorithm}-0" for task in (*SMALL, "HalfCheetah-v5")
-           for algorithm in ("DDPG", "DCN-DDPG")] + ["ArmEasy-v0/bonus/DN-DDPG-0"]
-BINS = 40  # of the histogram of visited states, in each direction
 DEATHS = 3  # a run whose process died so often is given up
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS",
                             "MKL_NUM_THREADS"), "1")
@@ -361,14 +363,6 @@ def owed_to(rows, config):
         found[rule, states] = dict(zip(values, owed.tolist(), strict=True))
     for row in rows:
         row["owed"] = found[row["rule"], row["states"]].get(row["updates"], np.nan)
-
-
-PLANES = {  # task: (x, y) of a state in the histogram of visits, from obs; their ranges
-    "Pendulum-v1": (lambda obs: (np.arctan2(obs[:, 1], obs[:, 0]), obs[:, 2]),
-                    ((-np.pi, np.pi), (-8.0, 8.0))),
-    "MountainCarContinuous-v0": (lambda obs: (obs[:, 0], obs[:, 1]),
-                                 ((-1.2, 0.6), (-0.07, 0.07))),
-}
 
 
 def visits(task, replay):
@@ -669,254 +663,7 @@ def one_thread():
         os.environ.update((name, before[name]) for name in ONE_THREAD if name in before)
 
 
-# --- 5. Loading -----------------------------------------------------------------------
-
-TABLES = ("evaluations", "bias")
-WHAT = (*TABLES, "episodes", "planes", "weights", "visits", "meta")
-
-
-def load_study(task=None, algorithm=None, variant="class", what="evaluations",
-               folder=None, rule=None):
-    """What was recorded. `None` for task, algorithm or variant means all of them.
-
-    what="evaluations", "bias": one pandas DataFrame. A bias is that of the policy that
-    acts; `rule="max_min"` or `"paired"` asks for that of the policy that chooses its
-    action so (measured for two actors on Pendulum, MountainCar and the Arms).
-    Anything else: a list of dicts, one per run, with task, algorithm, variant, seed and
-
-        episodes  step, length, episode_return                         (E,)
-        planes    step (T,), x (N,), y (N,), q (T, C, N, N), truth (T, N, N)
-        weights   step (T,), theta (T, P); for `load_agent_at`
-        visits    counts (N, N), x (N + 1,) and y (N + 1,), the cells' edges
-        meta      config, versions, processor, seconds, ..., first_losses (20, C)
-
-    T times of the run, N points of an axis; pictures have the axes [y, x]. A damaged
-    or foreign file is named in a warning and skipped. ValueError for an unknown `what`.
-    """
-    if what not in WHAT:
-        raise ValueError(f"what={what!r}: expected one of {', '.join(WHAT)}.")
-    found = []
-    pattern = f"{task or '*'}/{variant or '*'}/{algorithm or '*'}-*.npz"
-    for path in Path(folder or RECORDINGS).glob(pattern):
-        if path.name.startswith("."):  # half written
-            continue
-        try:
-            found += _read(path, what, rule)
-        except Exception as error:  # zipfile and NumPy raise a dozen kinds
-            warnings.warn(f"{path} is skipped: it is damaged, or no record of this "
-                          f"study ({type(error).__name__}: {error})", stacklevel=2)
-    found.sort(key=lambda one: _order(*(one[name] for name in RUN)))
-    return _frame(found) if what in TABLES else found
-
-
-RUN = ("task", "algorithm", "variant", "seed")
-
-
-def _order(task, algorithm, variant, seed):
-    tasks, algorithms = [*TASKS, task], [*ALGORITHMS, algorithm]
-    return (tasks.index(task), task, variant != "class", variant,
-            algorithms.index(algorithm), algorithm, seed)
-
-
-def _read(path, what, rule):
-    """What one record holds of `what`: a list of one dict, or of none."""
-    with open(path, "rb") as file, np.load(file, allow_pickle=False) as content:
-        meta = json.loads(str(content["meta"]))
-        if meta["format"] != FORMAT:
-            raise ValueError(f"format {meta['format']!r}, expected {FORMAT}")
-        config = meta["config"]
-        one = dict(task=config["task"], algorithm=config["algorithm"],
-                   variant=meta["variant"], seed=config["seed"])
-        name = "{task}/{variant}/{algorithm}-{seed}.npz".format(**one)
-        if path.parts[-3:] != Path(name).parts:
-            raise ValueError(f"it is a copy of {name}")  # and would count twice
-        if what in TABLES:
-            names, labels = meta[f"{what}_numbers"], meta[f"{what}_labels"]
-            if not names:
-                return []
-            table = content[what].astype(np.float64)
-            rows = slice(None)
-            if labels:
-                words = content[f"{what}_labels"]
-                rows = words[:, labels.index("rule")] == (rule or config["act_rule"])
-                one |= dict(zip(labels, words[rows].T, strict=True))
-            one |= dict(zip(names, table[rows].T, strict=True))
-        elif what == "episodes":
-            step, length, total = content["episodes"].T
-            one |= dict(step=step.astype(int), length=length.astype(int),
-                        episode_return=total)
-        elif what == "meta":
-            one |= meta | dict(first_losses=content["first_losses"])
-        elif what == "visits" and "visits" in content:
-            x, y = PLANES[one["task"]][1]
-            one |= dict(counts=content["visits"], x=np.linspace(*x, BINS + 1),
-                        y=np.linspace(*y, BINS + 1))
-        elif what == "planes" and "picture_q" in content:
-            for name in ("x", "y", "q", "truth"):
-                one[name] = content[f"picture_{name}"].astype(np.float32)
-            one |= dict(step=content["picture_steps"], x=one["x"][0], y=one["y"][0])
-        elif what == "weights" and "picture_theta" in content:
-            one |= dict(step=content["picture_steps"], config=json.dumps(config),
-                        theta=content["picture_theta"].astype(np.float32),
-                        obs_dim=meta["obs_dim"], action_dim=meta["action_dim"])
-        else:
-            return []
-    return [one]
-
-
-def _frame(found):
-    """One DataFrame of all runs' rows. A column that a run lacks is NaN there."""
-    import pandas as pd
-
-    whole = ("seed", "step", "updates", "n")
-    columns = {}
-    names = [*RUN, "step", "updates", *(name for one in found for name in one)]
-    for name in dict.fromkeys(names):
-        parts = [np.broadcast_to(one.get(name, np.nan), len(one["step"]))
-                 for one in found]
-        column = np.concatenate(parts) if parts else np.empty(0)
-        columns[name] = column.astype(int) if name in whole else column
-    return pd.DataFrame(columns)
-
-
-def score(table, column="mean"):
-    """A run's score, declared beforehand: the mean of its last ten evaluations.
-
-    On MuJoCo of its last five; never the maximum over time. `table` holds a task's
-    evaluations, or rows of bias that were chosen to be one per evaluation. Returns a
-    Series over (task, algorithm, variant, seed).
-    """
-    def last(runs):
-        return runs.tail(5 if runs.name[0] in MUJOCO_TASKS else 10).mean()
-
-    return table.sort_values("step").groupby([*RUN], sort=False)[column].apply(last)
-
-
-def load_agent_at(weights, i=-1):
-    """The agent of a run at its i-th recorded time; `weights` from `load_study`.
-
-    The weights were stored in float16. Slow copies equal the networks, moments are 0:
-    for acting and looking, not for going on with the training.
-    """
-    config = Config.from_json(weights["config"])
-    agent = make_agent(config, weights["obs_dim"], weights["action_dim"])
-    theta = weights["theta"][i]
-    agent.set_arrays(agent.arrays() | dict(theta=theta, theta_target=theta))
-    return agent
-
-
-def film(task, algorithm="DN-DDPG", variant="class", seed=0, folder=None):
-    """Film one episode of a recorded agent, from the start with seed 0, without noise.
-
-    Writes films/<task>-<variant>-<algorithm>.gif, and a strip of ten pictures as .png,
-    into the folder of the recordings. Returns both paths. ValueError where no weights
-    are recorded, or no picture can be made.
-    """
-    from PIL import Image
-
-    from dnddpg_minimal.__main__ import make_camera_env, play, write_film
-
-    folder = Path(folder or RECORDINGS)
-    weights = [one for one in load_study(task, algorithm, variant, "weights", folder)
-               if one["seed"] == seed]
-    if not weights:
-        name = f"{task}/{variant}/{algorithm}-{seed}"
-        raise ValueError(f"{folder} holds no weights of {name}")
-    agent = load_agent_at(weights[0])
-    env = make_camera_env(agent.config)
-    length = len(list(play(agent, env, seed=0)))
-    every = -(-length // 200)  # at most 200 pictures
-    images = [env.render() for step, _ in enumerate(play(agent, env, seed=0))
-              if step % every == 0]
-    seconds = every / env.metadata.get("render_fps", 30)
-    env.close()
-    path = folder / "films" / f"{task}-{variant}-{algorithm}.gif"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_film(path, images, seconds)
-    chosen = [Image.fromarray(images[i]).resize((150, 150), Image.Resampling.LANCZOS)
-              for i in np.linspace(0, len(images) - 1, 10).astype(int)]
-    strip = Image.new("RGB", (150 * len(chosen), 150))
-    for i, image in enumerate(chosen):
-        strip.paste(image, (150 * i, 0))
-    strip.quantize(64).save(path.with_suffix(".png"), optimize=True)
-    return path, path.with_suffix(".png")
-
-
-# --- 6. The table as measured ---------------------------------------------------------
-
-
-def results(variant="class", folder=None):
-    """Return and bias of every task and algorithm: mean, standard error, n of runs.
-
-    Each run counts by its `score`. The bias is the first critic's, at the policy's
-    action: over start states, on MuJoCo over on-policy states. A DataFrame over (task,
-    variant, algorithm); "return", "bias" and "owed" hold (mean, error, n).
-    """
-    import pandas as pd
-
-    returns = score(load_study(variant=variant, folder=folder))
-    rows = load_study(variant=variant, what="bias", folder=folder)
-    rows = rows[(rows.action == "policy") & (rows.critic == "0")
-                & rows.states.isin(("start", "on_policy"))]
-    runs = pd.DataFrame({"return": returns, "bias": score(rows, "bias"),
-                         "owed": score(rows, "owed")})
-    return runs, runs.groupby(["task", "variant", "algorithm"], sort=False).agg(
-        bias.summary)
-
-
-def claims(runs):
-    """What the paper says, against the runs of `results`: one row per task and claim.
-
-    Differences are paired by seed; a verdict needs a 95 % t-interval on one side of 0.
-    """
-    from scipy.stats import t
-
-    def of(name, algorithm):
-        return runs[name].xs(algorithm, level="algorithm").droplevel("variant")
-
-    dn, dcn, ddpg = "DN-DDPG", "DCN-DDPG", "DDPG"
-    said = {"return: DN > DDPG": of("return", dn) - of("return", ddpg),
-            "return: DN > DCN": of("return", dn) - of("return", dcn),
-            "bias: DDPG > 0": of("bias", ddpg),
-            "bias: DCN < 0": -of("bias", dcn),
-            "bias: DN > DCN": of("bias", dn) - of("bias", dcn)}
-    found = []
-    for claim, values in said.items():
-        for task, group in values.dropna().groupby(level="task", sort=False):
-            mean, error, n = bias.summary(group)
-            width = t.ppf(0.975, n - 1) * error if n > 1 else np.inf
-            verdict = ("not distinguishable" if not abs(mean) > width else
-                       "holds" if mean > 0 else "does not hold")
-            found.append(dict(task=task, claim=claim, mean=mean, error=error, n=n,
-                              verdict=verdict))
-    return found
-
-
-def write_readme(folder=None):
-    """Put the tables as measured into recordings/README.md, between its two marks."""
-    path = Path(folder or RECORDINGS) / "README.md"
-    begin, end = "<!-- measured -->\n", "<!-- end -->"
-    runs, table = results(None, folder)
-    text = [f"{len(runs)} runs. Each number: mean ± standard error (number of runs).\n"]
-    row = "| {} |".format
-    heads = ["task", "variant", "algorithm", "return", "bias of Q", "owed to lag"]
-    text += [row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
-    for names, values in table.iterrows():
-        cells = ["{:.4g} ± {:.2g} ({})".format(*value) if value[2] > 1 else
-                 "{:.4g} (1)".format(*value) for value in values]
-        text.append(row(" | ".join([*names, *cells])))
-    heads = ["claim", "task", "difference", "verdict"]
-    text += ["", row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
-    for one in claims(runs.xs("class", level="variant", drop_level=False)):
-        text.append("| {claim} | {task} | {mean:.3g} ± {error:.2g} ({n}) | {verdict} |"
-                    .format(**one))
-    before, _, after = path.read_text(encoding="utf-8").partition(begin)
-    after = after.partition(end)[2]
-    path.write_text(before + begin + "\n".join(text) + "\n" + end + after,
-                    encoding="utf-8", newline="\n")
-
-
-# --- 7. The command -------------------------------------------------------------------
+# --- 5. The command -------------------------------------------------------------------
 
 
 def main(argv=None):
@@ -966,10 +713,9 @@ def command(
         write_readme(folder)
         return 0
     if films:
-        for name in FILMED:
-            task_, variant_, file = name.split("/")
-            print(*film(task_, file[:-2], variant_, 0, folder))
-        return 0
+        from dnddpg_minimal.films import film_all
+
+        return film_all(folder)
     runs = [run for run in list_of(budget)
             if (not task or run.config.task in task)
             and (not algorithm or run.config.algorithm in algorithm)

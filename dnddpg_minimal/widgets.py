@@ -217,7 +217,7 @@ def error_plane_explorer(folder=None):
         error = plane["q"][i].min(axis=0) - plane["truth"][i]
         limit = max(np.quantile(np.abs(error), 0.95), 1.0)
         picture = dict(x=plane["x"], y=plane["y"])
-        image = plots._map(left, picture, error, plots.ERRORS, -limit, limit)
+        image = plots.draw_map(left, picture, error, plots.ERRORS, -limit, limit)
         left.plot(angle, velocity, "o", color="black", markerfacecolor="white")
         left.set(ylabel="velocity", title="min Q − truth")
         figure.colorbar(image, ax=left).set_label("← under   over →", fontsize=8)

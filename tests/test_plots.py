@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from dnddpg_minimal import ALGORITHMS, Record, plots
+from dnddpg_minimal.plots.__main__ import save_last_figure
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
@@ -121,4 +122,4 @@ def test_a_notebook_that_was_never_run_has_no_last_figure(tmp_path):
     path = tmp_path / "x.ipynb"
     path.write_text(json.dumps({"cells": [{"cell_type": "code", "outputs": []}]}))
     with pytest.raises(ValueError, match="run it first"):
-        plots.save_last_figure(path)
+        save_last_figure(path)

@@ -26,6 +26,7 @@ from dnddpg_minimal import (
     bias,
     bugs,
     make_agent,
+    records,
     study,
     to_env,
 )
@@ -478,7 +479,7 @@ def test_a_record_of_no_use_is_named_and_skipped(tmp_path, undisturbed, runs,
     (folder / "DDPG-0 (copy).npz").write_bytes(good)
     (folder / ".DDPG-9.npz.77.part").write_bytes(b"half")
     (folder / "DDPG-0.npz").write_bytes(good)
-    for what in study.WHAT:
+    for what in records.WHAT:
         with pytest.warns(UserWarning) as caught:
             found = study.load_study(variant="tiny", what=what, folder=tmp_path)
         messages = " ".join(str(one.message) for one in caught)
@@ -486,7 +487,7 @@ def test_a_record_of_no_use_is_named_and_skipped(tmp_path, undisturbed, runs,
             assert f"DDPG-{number}.npz is skipped" in messages
         assert "DDPG-0 (copy).npz is skipped" in messages
         assert "DDPG-9" not in messages
-        if what in study.TABLES:
+        if what in records.TABLES:
             assert set(found.seed) <= {0} and len(found)
     assert not (tmp_path / "executed").exists()
 
@@ -507,7 +508,7 @@ def test_350_records_load_in_two_seconds(tmp_path, undisturbed, runs):
         meta["config"]["seed"] = seed
         study.write_record(path_of(tiny(seed=seed), tmp_path),
                            arrays | dict(meta=json.dumps(meta)))
-    for what in study.TABLES:
+    for what in records.TABLES:
         begun = time.process_time()
         table = study.load_study(variant="tiny", what=what, folder=tmp_path)
         assert time.process_time() - begun < 2
@@ -587,7 +588,7 @@ def test_workers_end_when_their_study_is_killed(tmp_path):
 
 def test_the_readme_gets_its_tables_and_keeps_its_words(tmp_path, monkeypatch):
     monkeypatch.setattr(bias, "plane", partial(bias.plane, size=3))
-    for algorithm, seed in itertools.product(study.ALGORITHMS, (0, 1)):
+    for algorithm, seed in itertools.product(records.ALGORITHMS, (0, 1)):
         run = study.Run(tiny(algorithm, seed, steps=300).config, "class")
         study.record(run, tmp_path, tmp_path / "scratch")
     shutil.copy(study.RECORDINGS / "README.md", tmp_path)
@@ -597,7 +598,7 @@ def test_the_readme_gets_its_tables_and_keeps_its_words(tmp_path, monkeypatch):
     assert once.startswith(before[:before.index("<!-- measured -->")])
     assert "| Pendulum-v1 | class | DN-DDPG | " in once and "± " in once
     assert "| bias: DDPG > 0 | Pendulum-v1 | " in once
-    study.write_readme(tmp_path)
+    records.write_readme(tmp_path)
     assert (tmp_path / "README.md").read_text(encoding="utf-8") == once
 
 
@@ -605,12 +606,12 @@ def test_a_claim_needs_an_interval_on_one_side_of_zero():
     import pandas as pd
 
     index = pd.MultiIndex.from_tuples(
-        [("T", a, "class", s) for a in study.ALGORITHMS for s in range(5)],
-        names=study.RUN)
+        [("T", a, "class", s) for a in records.ALGORITHMS for s in range(5)],
+        names=records.RUN)
     noise = np.array([-1, 1, 0, 2, -2.0])
     runs = pd.DataFrame({"return": np.concatenate([noise, noise - 10, noise[::-1]]),
                          "bias": np.concatenate([noise - 9, noise - 5, noise])}, index)
-    verdicts = {one["claim"]: one["verdict"] for one in study.claims(runs)}
+    verdicts = {one["claim"]: one["verdict"] for one in records.claims(runs)}
     assert verdicts == {
         "return: DN > DDPG": "not distinguishable", "return: DN > DCN": "holds",
         "bias: DDPG > 0": "does not hold", "bias: DCN < 0": "holds",
@@ -747,7 +748,7 @@ def test_all_that_is_shipped_loads_and_is_small():
     assert sum(path.stat().st_size for path in files) < 25e6
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for what in study.WHAT:
+        for what in records.WHAT:
             assert len(study.load_study(variant=None, what=what))
     planned = {f"{run.name}.npz" for run in study.list_of("class")}
     names = {path.relative_to(study.RECORDINGS).as_posix() for path in SHIPPED}
@@ -755,7 +756,7 @@ def test_all_that_is_shipped_loads_and_is_small():
 
 
 @needs_recordings
-@pytest.mark.parametrize("algorithm", study.ALGORITHMS)
+@pytest.mark.parametrize("algorithm", records.ALGORITHMS)
 def test_two_thousand_steps_of_a_recorded_run_repeat_themselves(algorithm):
     """Failing means: the algorithm has changed, and must be recorded again."""
     found = study.load_study("Pendulum-v1", algorithm, what="meta")
