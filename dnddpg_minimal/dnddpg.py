@@ -206,6 +206,9 @@ class Config:
         if not (hidden and all(isinstance(h, Integral) and h >= 1 for h in hidden)):
             raise ValueError(f"hidden={self.hidden!r} is not allowed: expected widths "
                              "such as (64, 64), whole numbers of 1 or more.")
+        if not isinstance(self.task_options, dict | None):
+            raise ValueError(f"task_options={self.task_options!r} is not allowed: "
+                             "expected a dict such as {'goal_area': 'window'}.")
         if self.actors > self.critics:
             raise ValueError(f"actors={self.actors} with critics={self.critics}: actor "
                              "k climbs critic k, so expected actors <= critics.")
