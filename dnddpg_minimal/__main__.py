@@ -1,4 +1,4 @@
-"""The command line: `python -m dnddpg_minimal train | watch | study | benchmark`.
+"""The command line: `python -m dnddpg_minimal train | watch | study | ...`.
 
 `train` and `watch` are below; every other command is the `main(argv)` of the module of
 its name, imported only when asked for. A user's mistake gets one line on the error
@@ -120,6 +120,7 @@ class Interrupt:
         signal.signal(signal.SIGINT, self.before)
 
     def ask(self, *_):
+        """Called by the signal."""
         if self.asked:
             raise KeyboardInterrupt
         self.asked = True
@@ -173,6 +174,7 @@ def watch(
 ELSEWHERE = {
     "study": "Run, resume and list the recorded study.",
     "benchmark": "Measure the speed, side by side with a peer.",
+    "check": "Run an exercise notebook, and print its points.",
 }
 
 

@@ -141,10 +141,12 @@ class Watched(np.ndarray):
 
 
 def bare(array):
+    """The array without its watching."""
     return array.view(np.ndarray) if isinstance(array, Watched) else array
 
 
 def watched(array):
+    """The array, so that matrix products with it are noted."""
     return array.view(Watched) if isinstance(array, np.ndarray) else array
 
 
@@ -205,6 +207,7 @@ def update_beside_products(algorithm, rounds, updates):
 
 
 def random_batch(size, obs_dim, action_dim):
+    """A Batch of `size` random transitions, float32, the same at each call."""
     rng = np.random.default_rng(0)
     batch = Batch(rng.normal(size=(size, obs_dim)),
                   rng.uniform(-1, 1, (size, action_dim)), rng.normal(size=size),
@@ -276,14 +279,17 @@ def alternate(runs, rounds):
 
 
 def median(values):
+    """The median of a list of numbers."""
     return statistics.median(values)
 
 
 def spread(values, form):
+    """The lowest and the highest, each written by the format `form`."""
     return f"{form.format(min(values))} to {form.format(max(values))}"
 
 
 def shape(hidden):
+    """Widths as text: (64, 64) is 64-64."""
     return "-".join(map(str, hidden))
 
 

@@ -257,7 +257,7 @@ def stream(seed, role, index=0):
 
 
 def write_npz(path, save=np.savez, **arrays):
-    """Write arrays to one `.npz` file, whole or not at all.
+    """Write `arrays` to one `.npz` file at `path`, whole or not at all.
 
     The file is written under another name, and takes its own name when complete.
     `save=np.savez_compressed` makes it smaller and slower.
@@ -274,7 +274,7 @@ def write_npz(path, save=np.savez, **arrays):
 
 
 def read_npz(path):
-    """The arrays of a `.npz` file as a dict. Never unpickles.
+    """The arrays of the `.npz` file at `path` as a dict. Never unpickles.
 
     Raises FileNotFoundError if there is none, ValueError if it is damaged or foreign.
     """
@@ -515,7 +515,7 @@ def td_target(reward, terminated, q_next, gamma, rule="max_min", nu=0.1, y_min=N
 
 
 def choose_actor(q, rule="paired"):
-    """Which actor acts: Eq. (12). q (C, K, B) → index of an actor, (B,).
+    """Which actor acts: Eq. (12). q (C, K, B) → index of an actor, (B,), by `rule`:
 
         paired   argmax over k of critic k at actor k's action   Eq. (12) as printed
         max_min  argmax over k of the min over all critics
@@ -798,7 +798,10 @@ class TorchAgent(Agent):
 
 
 def make_agent(config, obs_dim, action_dim):
-    """The agent that `config.backend` names."""
+    """The agent that `config.backend` names, for these widths of obs and action.
+
+    obs_dim is O, action_dim is A.
+    """
     kind = TorchAgent if config.backend == "torch" else NumpyAgent
     return kind(config, obs_dim, action_dim)
 
@@ -824,7 +827,10 @@ def _quiet_mujoco():
 
 
 def make_env(config, render_mode=None):
-    """Make `config.task`, or refuse it with a ValueError that says why."""
+    """Make `config.task`, or refuse it with a ValueError that says why.
+
+    `render_mode`: None, "human" (a window) or "rgb_array" (pictures), as in Gymnasium.
+    """
     named = f"task={config.task!r}"
     try:
         if "mujoco" in str(gym.spec(config.task).entry_point):
@@ -921,6 +927,7 @@ class Training:
 
     @property
     def updates(self):
+        """Updates of the agent so far."""
         return self.agent.updates
 
     @property

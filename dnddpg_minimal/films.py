@@ -68,6 +68,7 @@ def make_camera_env(config):
         if hasattr(env.unwrapped, "model"):  # MuJoCo on a CPU: 4 times as fast without
             quality = env.unwrapped.model.vis.quality  # fine shadows and fine edges,
             quality.shadowsize, quality.offsamples = 512, 0  # and shrinking smooths too
+            follow_with_camera(env.unwrapped)
         env.reset(seed=0)
         if env.render() is None:
             raise ValueError(f"task={config.task!r} draws no pictures")
@@ -81,6 +82,16 @@ def make_camera_env(config):
     return env
 
 
+def follow_with_camera(env):
+    """Look through the model's own camera "track", if it has one.
+
+    Gymnasium 1.4 looks through a free camera, from which HalfCheetah runs away.
+    """
+    for i in range(env.model.ncam):
+        if env.model.camera(i).name == "track":
+            env.mujoco_renderer.camera_id = i
+
+
 def has_display():
     """False on a Linux that has no screen to open a window on."""
     return sys.platform != "linux" or bool(
@@ -88,6 +99,7 @@ def has_display():
 
 
 def check_display():
+    """ValueError if no window can be opened here."""
     if not has_display():
         raise ValueError("there is no display to open a window on: "
                          "write a film instead, with --film FILE.gif")

@@ -100,6 +100,7 @@ class ConstantReward(Probe):
 
     @staticmethod
     def observe(states):
+        """What the agent sees: states (N, S) → obs (N, O) float32."""
         return states.astype(np.float32)
 
     @staticmethod
@@ -133,6 +134,7 @@ class RealEnd(Probe):
 
     @staticmethod
     def observe(states):
+        """What the agent sees: states (N, S) → obs (N, O) float32."""
         return (states / RealEnd.length).astype(np.float32)
 
     @staticmethod
@@ -164,6 +166,7 @@ class ObservedReward(Probe):
 
     @staticmethod
     def observe(states):
+        """What the agent sees: states (N, S) → obs (N, O) float32."""
         return states.astype(np.float32)
 
     @staticmethod
@@ -200,6 +203,7 @@ class TwoSteps(Probe):
 
     @staticmethod
     def observe(states):
+        """What the agent sees: states (N, S) → obs (N, O) float32."""
         return (states / (2.0, 1.0)).astype(np.float32)
 
     @staticmethod
@@ -261,6 +265,7 @@ class LinearQuadratic(Probe):
 
     @staticmethod
     def observe(states):
+        """What the agent sees: states (N, S) → obs (N, O) float32."""
         return states.astype(np.float32)
 
     @staticmethod

@@ -86,12 +86,15 @@ ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS",
 
 
 class Run(NamedTuple):
+    """One run of a study: its config, what is special about it, perhaps a bug."""
+
     config: Config
     variant: str  # also a folder's name: nothing in it that Windows refuses
     bug: str | None = None  # a name of bugs.BUGS
 
     @property
     def name(self):
+        """task/variant/algorithm-seed: where its record lies, without the suffix."""
         config = self.config
         return f"{config.task}/{self.variant}/{config.algorithm}-{config.seed}"
 
@@ -228,6 +231,7 @@ class Notes:
         self.pictures = {}  # step: dict of arrays
 
     def save(self, path):
+        """Write the notes to one file, whole or not at all."""
         rows = dict(evaluations=self.evaluations, bias=self.bias, probe=self.probe,
                     seconds=self.seconds, code=code())
         arrays = {f"{step}/{name}": array for step, arrays in self.pictures.items()
@@ -399,6 +403,7 @@ class Checkpoint:
             ("training.npz", "notes.npz", "lock", "status"))
 
     def save(self, training, notes):
+        """Write both, so that a run killed at any moment goes on from here."""
         notes.save(self.notes)  # first: notes may know more than the Training, not less
         training.save(self.training)
 
@@ -435,6 +440,7 @@ class Checkpoint:
                 part.unlink(missing_ok=True)
 
     def remove(self):
+        """Delete the files of a run that is recorded."""
         for path in (self.training, self.notes, self.status):
             path.unlink(missing_ok=True)
 
@@ -460,11 +466,13 @@ def only_one(path):
 
 
 def write_record(path, arrays):
+    """Write a record into its folder, compressed, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_npz(path, save=np.savez_compressed, **arrays)
 
 
 def versions():
+    """Versions of Python and of the packages that decide a run's numbers: a dict."""
     found = {"python": platform.python_version()}
     for name in ("numpy", "gymnasium", "mujoco"):
         with suppress(PackageNotFoundError):
@@ -521,11 +529,13 @@ class Slot:
         self.renew()
 
     def renew(self):
+        """Start a new process."""
         self.executor = ProcessPoolExecutor(
             1, mp_context=get_context("spawn"), initializer=_start_worker,
             initargs=(self.stop, self.nice))
 
     def submit(self, *call):
+        """As Executor.submit; a process that died while idle is replaced first."""
         try:
             return self.executor.submit(*call)
         except BrokenExecutor:  # its process died while it had nothing to do
@@ -533,9 +543,11 @@ class Slot:
             return self.executor.submit(*call)
 
     def ask_to_stop(self):
+        """The run goes on to its next record, and saves its checkpoint."""
         self.stop.set()
 
     def close(self):
+        """Wait for the process to end."""
         self.executor.shutdown(wait=True, cancel_futures=True)
 
 
@@ -552,12 +564,14 @@ class Cluster:
         self.submit = self.executor.submit
 
     def renew(self):
-        pass
+        """Nothing to do: the cluster looks after its workers."""
 
     def ask_to_stop(self):
-        self.executor.shutdown(wait=False)  # a run that has begun goes on to its end
+        """No further run is begun; one that has begun goes on to its end."""
+        self.executor.shutdown(wait=False)
 
     def close(self):
+        """Leave the cluster."""
         self.client.close()
 
 

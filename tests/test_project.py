@@ -1,7 +1,10 @@
 """The project as a whole: its commands, its pins, its notebooks, its files."""
 
+import importlib
+import inspect
 import json
 import os
+import pkgutil
 import re
 import shutil
 import subprocess
@@ -10,6 +13,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
+
+import dnddpg_minimal
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -165,3 +170,39 @@ def test_no_stored_output_is_an_error_or_a_warning(notebook):
         for output in cell["outputs"]:
             assert output["output_type"] != "error" or expected, output["ename"]
             assert output.get("name") != "stderr", output["text"]
+
+
+# --- documentation --------------------------------------------------------------------
+
+
+def public_things():
+    """(name, object) of every public function, class and method of the package."""
+    for module in pkgutil.walk_packages(dnddpg_minimal.__path__, "dnddpg_minimal."):
+        for name, thing in vars(importlib.import_module(module.name)).items():
+            if name.startswith("_") or getattr(thing, "__module__", "") != module.name:
+                continue
+            if inspect.isfunction(thing) or inspect.isclass(thing):
+                yield f"{module.name}.{name}", thing
+            if inspect.isclass(thing):
+                for part, member in vars(thing).items():
+                    kinds = (property, classmethod, staticmethod)
+                    if not part.startswith("_") and (inspect.isfunction(member)
+                                                     or isinstance(member, kinds)):
+                        yield f"{module.name}.{name}.{part}", getattr(thing, part)
+
+
+def test_every_public_name_has_a_docstring():
+    """A method may inherit it from its base class."""
+    silent = [name for name, thing in public_things() if not inspect.getdoc(thing)]
+    assert not silent
+
+
+@pytest.mark.parametrize("name", dnddpg_minimal.__all__)
+def test_the_docstring_of_an_exported_function_names_its_arguments(name):
+    thing = getattr(dnddpg_minimal, name)
+    if not inspect.isfunction(thing):
+        pytest.skip("no function")
+    said, symbols = inspect.getdoc(thing), {"gamma": "γ", "nu": "ν"}
+    missing = [word for word in inspect.signature(thing).parameters
+               if word not in said and symbols.get(word, word) not in said]
+    assert not missing

@@ -40,12 +40,14 @@ def style_of(label):
 
 
 def draw_lines(ax, curves):
+    """One line for each entry of curves, {label: (x, y)}, in its algorithm's style."""
     for label, (updates, values) in curves.items():
         ax.plot(updates, values, label=label, **{"linewidth": 1.8} | style_of(label))
     legend_below(ax)
 
 
 def legend_below(ax):
+    """The legend under the axes, out of the way of the lines."""
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=3)
 
 
@@ -57,6 +59,7 @@ def note_level(ax, level, text, above=True):
 
 
 def thousands(ax):
+    """Numbers of steps on the x axis with a space between thousands: 40 000."""
     ax.xaxis.set_major_formatter(lambda x, _: f"{x:,.0f}".replace(",", " "))
 
 
@@ -83,10 +86,12 @@ def draw_map(ax, picture, values, colours, low=None, high=None):
 
 
 def is_angle(x):
+    """Does the axis x (N,) go once around the circle?"""
     return np.allclose((x[0], x[-1]), (-np.pi, np.pi), atol=0.01)  # recorded: float16
 
 
 def angle_ticks(ax):
+    """Ticks at multiples of π/2 on the x axis."""
     ax.set_xticks([-np.pi, -np.pi / 2, 0, np.pi / 2, np.pi],
                   ["−π", "−π/2", "0", "π/2", "π"])
 
