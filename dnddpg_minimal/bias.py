@@ -30,6 +30,7 @@ plane(agent, world, x, y)               Q and truth over two state variables
 summary(values)                         mean, standard error, n
 owed(updates, values, config)           the bias that a critic has because it lags
 predict(sigma, kappa, rho, rule)        the bias that one target makes, closed form
+take_apart(agent, world, states)        a bias as two sums: optimism, the target's rule
 
 Shapes: C critics, K actors, B batch, N states, O observation, A action, S state.
 Whom we follow: Fujimoto et al. 2018 (TD3), section 4.1, who compare Q with the returns
@@ -84,11 +85,20 @@ class Dynamics:
         self.rng = np.random.default_rng(0)  # for a task with chance in its steps
 
     def reset(self, rng, n):
+        """States (n, S) at the start of n episodes, as the task itself draws them."""
         self.rng, starts = rng, []
         for seed in rng.integers(2**31, size=n):
             self.env.reset(seed=int(seed))
             starts.append(np.asarray(self.task.state, np.float64).ravel())
         return np.array(starts)
+
+    def observe(self, states):
+        """What an agent sees: states (N, S) → obs (N, O) float32."""
+        raise NotImplementedError
+
+    def step(self, states, action):
+        """states (N, S), action (N, A) in [-1, 1] → next states, reward, terminated."""
+        raise NotImplementedError
 
     def on_goal(self, states):
         """Steps in a row on the goal: (N,). Only the Arms count them."""
@@ -656,6 +666,45 @@ def owed(updates, values, config):
         out.append(debt)
         last = now
     return np.array(out)
+
+
+def take_apart(agent, world, states):
+    """A bias taken apart along the path of the policy: Eq. (5.5) of chapter 05.
+
+    From each of N states (N, S) the policy that acts is followed. With q_mean(t) the
+    mean of the online critics at the action that it takes at step t, and delta(t) what
+    `target_rule` says there minus q_mean(t),
+
+        q_mean(0) - truth = sum over t >= 0 of gamma^t [q_mean(t) - r - gamma v(t + 1)]
+                          + sum over t >= 1 of gamma^t delta(t),   v = q_mean + delta.
+
+    A dict: `above` (N,), the first sum, how far the critics lie above their own
+    targets; `rule` (N,), the second one; `bias` (N,), both together; `delta` (T, N).
+    All in units of return. What comes after the horizon counts as the first sum.
+    ValueError where a world ends on the way: the sums are those of an endless path.
+    """
+    config, n = agent.config, len(states)
+    rows, nothing = np.arange(n), np.zeros(n)  # no reward, no end: y is the rule itself
+    q_mean, delta = [], []
+
+    def watched(obs):
+        if len(obs) < n:
+            raise ValueError(f"a world of {config.task} ended on the way: expected "
+                             "a task, or states, without a real end.")
+        actions = agent.actions(obs)  # (K, N, A)
+        q = np.stack([agent.q_values(obs, a) for a in actions], axis=1)  # (C, K, N)
+        q = np.asarray(q, np.float64)
+        chosen = choose_actor(q, config.act_rule)  # (N,)
+        q_mean.append(q.mean(axis=0)[chosen, rows])  # over C
+        said = td_target(nothing, nothing, q, 1.0, config.target_rule, config.nu)
+        delta.append(said - q_mean[-1])
+        return actions[chosen, rows]
+
+    truth = rollout(world, states, watched, config.gamma)["truth"]
+    bias, delta = q_mean[0] - truth, np.array(delta)
+    rule = config.gamma ** np.arange(1, len(delta)) @ delta[1:]
+    return {"above": bias - rule, "rule": rule, "bias": bias, "delta": delta}
+
 
 
 # One target's own bias. e[c, k] is critic c's error at actor k's action: jointly

@@ -12,6 +12,7 @@
 import math
 import os
 import sys
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from dnddpg_minimal.records import FILMED, RECORDINGS, load_agent_at, load_study
 
 FILM_LENGTH = 200  # pictures at most
 FILM_WIDTH = 300  # pixels at most
+SECONDS, FRAMES, WIDTH = 10, 100, 200  # of a film of the study, at most
 FILM_COLOURS = 32
 SHORTEST_PICTURE = 20  # milliseconds; viewers slow down a film that is faster
 
@@ -36,16 +38,16 @@ def play(agent, env, seed):
         yield float(reward)
 
 
-def write_film(path, pictures, seconds):
+def write_film(path, pictures, seconds, width=FILM_WIDTH):
     """Write a GIF of the pictures, each (height, width, 3) uint8, with one palette.
 
-    seconds: how long each picture stays.
+    seconds: how long each picture stays; width: in pixels, at most.
     """
     from PIL import Image
 
     small = [Image.fromarray(picture) for picture in pictures]
     for image in small:
-        image.thumbnail((FILM_WIDTH, FILM_WIDTH))
+        image.thumbnail((width, width))
     samples = small[:: math.ceil(len(small) / 10)]
     width, height = small[0].size
     strip = Image.new("RGB", (width, height * len(samples)))
@@ -106,8 +108,9 @@ def check_display():
 
 
 def film(task, algorithm="DN-DDPG", variant="class", seed=0, folder=None):
-    """Film one episode of a recorded agent, from the start with seed 0, without noise.
+    """Film a recorded agent from the start with seed 0, without noise.
 
+    One episode, at most its first ten seconds: that is enough to see a gait.
     Writes films/<task>-<variant>-<algorithm>.gif, and a strip of ten pictures as .png,
     into the folder of the recordings. Returns both paths. ValueError where no weights
     are recorded, or no picture can be made.
@@ -122,15 +125,15 @@ def film(task, algorithm="DN-DDPG", variant="class", seed=0, folder=None):
         raise ValueError(f"{folder} holds no weights of {name}")
     agent = load_agent_at(weights[0])
     env = make_camera_env(agent.config)
-    length = len(list(play(agent, env, seed=0)))
-    every = -(-length // 200)  # at most 200 pictures
-    images = [env.render() for step, _ in enumerate(play(agent, env, seed=0))
-              if step % every == 0]
-    seconds = every / env.metadata.get("render_fps", 30)
+    fps = env.metadata.get("render_fps", 30)
+    length = sum(1 for _ in islice(play(agent, env, seed=0), SECONDS * fps))
+    every = -(-length // FRAMES)
+    again = islice(play(agent, env, seed=0), length)
+    images = [env.render() for step, _ in enumerate(again) if step % every == 0]
     env.close()
     path = folder / "films" / f"{task}-{variant}-{algorithm}.gif"
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_film(path, images, seconds)
+    write_film(path, images, every / fps, WIDTH)
     chosen = [Image.fromarray(images[i]).resize((150, 150), Image.Resampling.LANCZOS)
               for i in np.linspace(0, len(images) - 1, 10).astype(int)]
     strip = Image.new("RGB", (150 * len(chosen), 150))

@@ -4,6 +4,8 @@
 |---|---|
 | `maximisation_laboratory(...)` | the bias of one target, chapters 04 to 06 |
 | `error_plane_explorer()` | a recorded agent on Pendulum: its error, state by state |
+| `arm_explorer()` | the Arm: observation, reward, and what two actors propose |
+| `figure_6_explorer()` | learning curves and scores, drawn in your own way |
 | `live_training(config)` | a run in front of a class: start, pause, stop |
 
 A panel is sliders, one line of text, and one picture. The text says what the picture
@@ -21,8 +23,15 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dnddpg_minimal import bias, plots
-from dnddpg_minimal.dnddpg import ALGORITHMS, Config, Training, stream, td_target
+from dnddpg_minimal import arm, bias, plots
+from dnddpg_minimal.dnddpg import (
+    ALGORITHMS,
+    Config,
+    Training,
+    choose_actor,
+    stream,
+    td_target,
+)
 
 
 class Panel(ipywidgets.VBox):
@@ -34,20 +43,24 @@ class Panel(ipywidgets.VBox):
         return f"Panel: {self.title}"
 
 
-def panel(title, sliders, draw, size=(6.4, 2.9)):
+def panel(title, sliders, draw, size=(6.4, 2.9), lines=1):
     """Sliders (a dict from a name to a widget) above a text and a picture.
 
-    `draw(figure, **values)` fills an empty matplotlib Figure and returns the text. It
-    is called now, and again whenever a slider moves.
+    `draw(figure, **values)` fills an empty matplotlib Figure and returns the text, or
+    with `lines` above 1 a tuple of so many lines. It is called now, and again whenever
+    a slider moves.
     """
-    text = ipywidgets.Label()
-    picture = ipywidgets.Image(format="png")
+    texts = [ipywidgets.Label() for _ in range(lines)]
     figure = Figure(figsize=size, dpi=90)  # without pyplot, which would keep it
+    natural = ipywidgets.Layout(width=f"{90 * size[0]:.0f}px", max_width="100%")
+    picture = ipywidgets.Image(format="png", layout=natural)  # else it is stretched
     canvas = FigureCanvasAgg(figure)
 
     def update(_=None):
         figure.clear()
-        text.value = draw(figure, **{name: s.value for name, s in sliders.items()})
+        said = draw(figure, **{name: s.value for name, s in sliders.items()})
+        for text, line in zip(texts, (said,) if lines == 1 else said, strict=True):
+            text.value = line
         file = io.BytesIO()
         canvas.print_png(file, pil_kwargs={"compress_level": 1})  # quick, not small
         picture.value = file.getvalue()
@@ -55,7 +68,7 @@ def panel(title, sliders, draw, size=(6.4, 2.9)):
     for slider in sliders.values():
         slider.observe(update, names="value")
     update()
-    whole = Panel([*sliders.values(), text, picture])
+    whole = Panel([*sliders.values(), *texts, picture])
     whole.title = title
     return whole
 
@@ -254,6 +267,183 @@ def follow(world, agent, state, steps=500, shown=150):
         state, reward, _ = world.step(state, agent.act(world.observe(state)))
         truth += agent.config.gamma**t * reward[0]
     return np.array(path), truth
+
+
+# --- The arm explorer: chapter 07 -----------------------------------------------------
+
+WAY = 25  # steps for which each actor's own way is drawn
+
+
+def arm_explorer(folder=None):
+    """Move the arm and its goal: what does the agent see, and what do actors propose?
+
+    Sliders for both joints and the goal. The text gives reward, observation, and each
+    actor's proposal with every critic's Q; the picture also draws the finger's way if
+    that actor alone acts. The agents are recorded DN-DDPG ones of the two Arms, the
+    lowest seed with weights, at the end. `folder` holds recordings, by default those of
+    the package. FileNotFoundError if there is none.
+    """
+    agents = recorded_arm_agents(folder)
+    if not agents:
+        raise FileNotFoundError("no recorded weights of DN-DDPG on an Arm: record them "
+                                "with python -m dnddpg_minimal study --task "
+                                "ArmEasy-v0 --algorithm DN-DDPG")
+
+    def draw(figure, agent, joint_1, joint_2, goal_x, goal_y):
+        state = np.array([[joint_1, joint_2, goal_x, goal_y, 0.0]])
+        seen = look_at_arm(agents[agent], state)
+        axes = figure.subplots(1, 3, width_ratios=(1, 0.6, 0.8), gridspec_kw=dict(
+            left=0.01, right=0.98, bottom=0.04, top=0.9, wspace=0.6))
+        plots.plot_arm(state[0], seen["paths"], seen["q"], axes)
+        return (f"Finger {seen['distance']:.0f} px from the goal's centre: reward "
+                f"{seen['reward']:+.3f}. " + proposals_in_words(seen),
+                "Observation: " + ", ".join(f"{x:+.2f}" for x in seen["obs"]) + ".")
+
+    names = list(agents)
+    controls = {
+        "agent": ipywidgets.Dropdown(
+            options=names, value=names[0], description="recorded agent",
+            style={"description_width": "18em"},
+            layout=ipywidgets.Layout(width="38em")),
+        "joint_1": slider("joint 1, rad", 1.5, 0.0, 6.28, 0.05),
+        "joint_2": slider("joint 2, against link 1, rad", 4.0, 0.0, 6.28, 0.05),
+        "goal_x": slider("goal x, px in the window", 100.0, 0.0, 400.0, 5.0),
+        "goal_y": slider("goal y, px in the window", 100.0, 0.0, 400.0, 5.0),
+    }
+    return panel("the arm explorer", controls, draw, size=(7.6, 2.9), lines=2)
+
+
+def recorded_arm_agents(folder=None):
+    """Recorded DN-DDPG agents of the Arms at the end: a dict from a name to an agent.
+
+    The lowest seed with weights of each task; a task without any is not in the dict.
+    """
+    from dnddpg_minimal.study import load_agent_at, load_study
+
+    agents = {}
+    for task in ("ArmEasy-v0", "ArmHard-v0"):
+        runs = load_study(task, "DN-DDPG", what="weights", folder=folder)
+        if runs:
+            run = min(runs, key=lambda run: run["seed"])
+            agents[f"DN-DDPG of {task}, seed {run['seed']}"] = load_agent_at(run)
+    return agents
+
+
+def look_at_arm(agent, state):
+    """What an agent sees and says at one state (1, 5): a dict.
+
+    obs (9,), distance in px, reward (of a step that ends here), actions (K, 2),
+    q (C, K), chosen (the actor that acts), paths: (T, xy) px from the base, per actor.
+    """
+    obs = arm.observe(state)
+    actions = agent.actions(obs)  # (K, 1, A)
+    q = np.stack([agent.q_values(obs, a)[:, 0] for a in actions], axis=1)  # (C, K)
+    chosen = int(choose_actor(q[:, :, None], agent.config.act_rule)[0])
+    alone = np.repeat(state, len(actions), axis=0)  # row k: actor k acts alone
+    rows, paths = np.arange(len(actions)), []
+    for _ in range(WAY + 1):
+        paths.append(arm.locate(alone[:, :2])[:, 1])
+        alone, _, _ = arm.step(alone, agent.actions(arm.observe(alone))[rows, rows])
+    gap = state[0, 2:4] - arm.BASE - paths[0][0]
+    distance = float(np.hypot(*gap))
+    return dict(obs=obs[0], distance=distance, reward=-distance / 400, q=q,
+                actions=actions[:, 0], chosen=chosen, paths=np.swapaxes(paths, 0, 1))
+
+
+def proposals_in_words(seen):
+    """The proposals of `look_at_arm`, for the text below the sliders."""
+    words = []
+    for k, action in enumerate(seen["actions"]):
+        values = ", ".join(f"Q{c + 1} {q:.2f}" for c, q in enumerate(seen["q"][:, k]))
+        words.append(f"Actor {k + 1} turns ({action[0]:+.2f}, {action[1]:+.2f}): "
+                     f"{values}.")
+    return " ".join(words) + f" Actor {seen['chosen'] + 1} acts."
+
+
+# --- The Figure 6 explorer: chapter 10 ------------------------------------------------
+
+AXES = {"environment steps, evaluations": "evaluations",
+        "episodes, training returns": "episodes"}
+INTERVALS = {"t interval": "t_interval", "bootstrap": "bootstrap_interval",
+             "band of standard deviation": "band"}
+SCORES = {"end: the last ten (five on MuJoCo)": "end", "whole run": "whole",
+          "the last one": "final", "the best one (do not)": "maximum"}
+
+
+def figure_6_explorer(folder=None):
+    """Draw the paper's Figure 6 in your own way, and see what the verdict does.
+
+    Choose a task, the axis (evaluations over steps, or training returns over episodes,
+    means of ten), the interval, and what counts as a run's score. Left the curves of
+    all runs, right their scores. The text gives the paired difference of DN-DDPG and
+    DDPG with its t interval, and the verdict on "DN-DDPG is better". `folder` holds
+    recordings, by default those of the package.
+    """
+    from dnddpg_minimal import statistics
+    from dnddpg_minimal.records import TASKS, load_study
+
+    tables = {"evaluations": load_study(folder=folder), "episodes":
+              statistics.training_table(load_study(what="episodes", folder=folder))}
+    tables = {(task, axis): rows for axis, table in tables.items()
+              for task, rows in table.groupby("task")}
+
+    def draw(figure, task, axis, interval, score):
+        table = tables.get((task, AXES[axis]))
+        if table is None:
+            return (f"{task}: not recorded yet. python -m dnddpg_minimal study "
+                    f"--task {task}")
+        of_interval = getattr(statistics, INTERVALS[interval])
+        found = statistics.scores(table, SCORES[score]).loc[task]
+        left, right = figure.subplots(1, 2, width_ratios=(1.5, 1), gridspec_kw=dict(
+            left=0.09, right=0.98, bottom=0.17, top=0.9, wspace=0.35))
+        names = [name for name in ALGORITHMS if (table.algorithm == name).any()]
+        for x, name in enumerate(names):
+            style, values = plots.STYLE[name], found[name].to_numpy()
+            curve = statistics.by_step(table[table.algorithm == name])
+            draw_curve(left, *curve, of_interval, style, name)
+            right.plot(np.full(len(values), x - 0.15), values, "o", markersize=4,
+                       markerfacecolor="white", markeredgecolor=style["color"])
+            right.plot([x + 0.15] * 2, of_interval(values), color=style["color"])
+            right.plot(x + 0.15, values.mean(), "D", color=style["color"], markersize=5)
+        left.set(title="mean of the runs, and each run", xlabel=axis.partition(",")[0])
+        left.legend(fontsize=7.5)
+        plots.thousands(left)
+        for ax, most in ((left.xaxis, 4), (left.yaxis, 5), (right.yaxis, 5)):
+            ax.get_major_locator().set_params(nbins=most)
+        right.set_xticks(range(len(names)), names, fontsize=8)
+        right.set(title="score of each run, mean", xlim=(-0.5, len(names) - 0.5))
+        d = statistics.paired(found, "DN-DDPG", "DDPG")
+        said = statistics.verdict(d)
+        if len(d) < statistics.FEWEST:
+            return f"{task}: DN-DDPG better than DDPG: {said}."
+        low, high = statistics.t_interval(d)
+        return (f"{task}, n = {len(d)}: DN − DDPG {d.mean():+.3g}, t interval "
+                f"[{low:+.3g}, {high:+.3g}]; “DN-DDPG is better”: {said}.")
+
+    return panel("the Figure 6 explorer", {
+        "task": menu("task", TASKS), "axis": menu("axis", AXES),
+        "interval": menu("interval", INTERVALS), "score": menu("score", SCORES),
+    }, draw, size=(7.4, 2.9))
+
+
+def draw_curve(ax, x, values, of_interval, style, name):
+    """Runs as thin lines, their mean as a thick one, an interval as a shade."""
+    if len(values) > 1:
+        ax.fill_between(x, *of_interval(values), color=style["color"], alpha=0.25,
+                        linewidth=0)
+    # One line with gaps for all runs is drawn sooner than many lines.
+    runs = np.hstack([values, np.full((len(values), 1), np.nan)])
+    ax.plot(np.tile(np.append(x, np.nan), len(values)), runs.ravel(), linewidth=0.4,
+            color=style["color"], alpha=0.5)
+    ax.plot(x, values.mean(axis=0), linewidth=1.8, label=name, **style)
+
+
+def menu(label, options):
+    """A menu of `options`, the first one chosen, with its name in full beside it."""
+    options = list(options)
+    return ipywidgets.Dropdown(options=options, value=options[0], description=label,
+                               style={"description_width": "18em"},
+                               layout=ipywidgets.Layout(width="38em"))
 
 
 # --- The live training panel ----------------------------------------------------------

@@ -644,6 +644,59 @@ def test_a_bias_made_anew_in_each_target_grows_a_hundredfold():
     assert q == pytest.approx(99.0)
 
 
+@pytest.mark.parametrize("algorithm", ["DDPG", "DCN-DDPG", "DN-DDPG"])
+def test_a_bias_is_the_sum_of_what_eq_5_5_says_term_by_term(algorithm):
+    agent = make_agent(Config("Pendulum-v1", algorithm, gamma=0.95, dtype="float64"),
+                       obs_dim=3, action_dim=1)
+    world = instrument.dynamics(agent.config)
+    starts = world.reset(np.random.default_rng(4), 3)
+    found = instrument.take_apart(agent, world, starts)
+
+    def look(states):  # the executed action, the critics' mean there, max of the min
+        obs = world.observe(states)
+        actions = agent.actions(obs)
+        q = np.stack([agent.q_values(obs, a) for a in actions], axis=1)  # (C, K, 3)
+        picked = [np.argmax([q[k, k, n] for k in range(q.shape[1])]) for n in range(3)]
+        action = np.array([actions[k, n] for n, k in enumerate(picked)])
+        mean = np.array([q[:, k, n].mean() for n, k in enumerate(picked)])
+        return action, mean, q.min(axis=0).max(axis=0)
+
+    above, rule, truth, states = np.zeros(3), np.zeros(3), np.zeros(3), starts
+    action, first, _ = look(states)
+    mean = first
+    for t in range(500):
+        states, reward, _ = world.step(states, action)
+        action, mean_next, v_next = look(states)
+        above += 0.95**t * (mean - reward - 0.95 * v_next)
+        rule += 0.95 ** (t + 1) * (v_next - mean_next)
+        truth += 0.95**t * reward
+        mean = mean_next
+    assert np.allclose(found["bias"], first - truth, atol=1e-6)
+    assert np.allclose(found["rule"], rule, atol=1e-6)
+    assert np.allclose(found["above"], above, atol=1e-6)
+    assert (np.abs(found["rule"]).max() > 0.01) == (algorithm != "DDPG")
+
+
+def test_two_critics_a_constant_apart_make_the_same_delta_at_each_step():
+    config = Config("Pendulum-v1", "DCN-DDPG")
+    agent = FakeAgent(config, swing, lambda obs, action: np.repeat([[-7.0], [-4.0]],
+                                                                   len(obs), axis=1))
+    world = instrument.dynamics(config)
+    found = instrument.take_apart(agent, world, np.array([[3.0, 0.0], [1.0, 2.0]]))
+    assert np.allclose(found["delta"], -1.5)  # half of the distance 3: Eq. (5.4)
+    # 499 of endless many terms, from t = 1 on
+    assert np.allclose(found["rule"], -1.5 * (0.99 - 0.99**500) / 0.01)
+
+
+def test_a_bias_is_not_taken_apart_where_the_world_ends():
+    config = Config("MountainCarContinuous-v0", "DDPG")
+    agent = FakeAgent(config, lambda obs: np.sign(obs[:, 1:]),  # pumps up, and arrives
+                      lambda obs, action: np.zeros((1, len(obs))))
+    world = instrument.dynamics(config)
+    with pytest.raises(ValueError, match="ended"):
+        instrument.take_apart(agent, world, np.array([[-0.5, 0.0], [0.4, 0.0]]))
+
+
 # --- The picture, and the summary ---
 
 

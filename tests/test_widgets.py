@@ -2,6 +2,7 @@
 
 import time
 
+import numpy as np
 import pytest
 
 from dnddpg_minimal import Config, widgets
@@ -76,3 +77,59 @@ def test_a_run_that_breaks_off_says_so_in_the_panel():
     panel.start_button.click()
     wait_until(lambda: "broke off" in panel.text.value)
     assert "NoSuchTask-v0" in panel.text.value
+
+
+def test_every_control_of_the_arm_explorer_changes_text_and_picture():
+    if not widgets.recorded_arm_agents():
+        pytest.skip("no weights of DN-DDPG on an Arm are recorded")
+    panel = widgets.arm_explorer()
+    agent, *controls, text, observation, picture = panel.children
+    for control, value in zip(controls, (2.0, 3.0, 300.0, 250.0), strict=True):
+        before = text.value, observation.value, picture.value
+        control.value = value
+        assert text.value != before[0]
+        assert observation.value != before[1]
+        assert picture.value != before[2]
+        assert control.description
+    assert "Actor 1 turns" in text.value and "Q1" in text.value
+    for name in agent.options:
+        agent.value = name  # every recorded agent can be looked at
+
+
+def test_the_arm_explorer_shows_the_reward_and_the_actor_that_acts():
+    agents = widgets.recorded_arm_agents()
+    if not agents:
+        pytest.skip("no weights of DN-DDPG on an Arm are recorded")
+    agent = next(iter(agents.values()))
+    state = np.array([[0.0, 0.0, 300.0, 200.0, 0.0]])  # straight to the right
+    seen = widgets.look_at_arm(agent, state)
+    assert seen["distance"] == pytest.approx(100)  # finger at x = 400, goal at 300
+    assert seen["reward"] == pytest.approx(-0.25)
+    acts = seen["actions"][seen["chosen"]]
+    np.testing.assert_allclose(acts, agent.act(seen["obs"]), atol=1e-6)
+    assert seen["paths"].shape == (2, widgets.WAY + 1, 2)
+    np.testing.assert_allclose(seen["paths"][:, 0], 2 * [[200, 0]], atol=1e-9)
+
+
+def test_the_arm_explorer_says_where_recordings_are_missing(tmp_path):
+    with pytest.raises(FileNotFoundError, match="study"):
+        widgets.arm_explorer(folder=tmp_path)
+
+
+def test_every_menu_of_the_figure_6_explorer_changes_text_or_picture():
+    panel = widgets.figure_6_explorer()
+    *menus, text, picture = panel.children
+    assert [menu.description for menu in menus] == ["task", "axis", "interval", "score"]
+    assert "Pendulum-v1, n = " in text.value and "not distinguishable" in text.value
+    for menu in menus[1:]:
+        for option in menu.options[1:]:
+            before = text.value, picture.value
+            menu.value = option
+            assert (text.value, picture.value) != before, (menu.description, option)
+
+
+def test_the_figure_6_explorer_says_which_command_records_a_missing_task(tmp_path):
+    panel = widgets.figure_6_explorer(folder=tmp_path)
+    task, *_, text, _ = panel.children
+    task.value = "Hopper-v5"
+    assert "python -m dnddpg_minimal study --task Hopper-v5" in text.value

@@ -10,12 +10,14 @@ from dnddpg_minimal.plots.style import (
     STYLE,
     TRUTH,
     VALUES,
+    WRONG,
     angle_ticks,
     draw_lines,
     draw_map,
     is_angle,
     legend_below,
     note_level,
+    pale,
     shrink,
     thousands,
 )
@@ -67,7 +69,7 @@ def plot_bias(curves, predicted=None, ax=None, title=""):
     note_level(ax, 0, SIGN)
     for label, level in (predicted or {}).items():
         ax.axhline(level, color=GREY, linewidth=1)
-        note_level(ax, level, label, above=False)
+        note_level(ax, level, label, above=level == max(predicted.values()))
     draw_lines(ax, curves)
     ax.set(title=title, xlabel="updates", ylabel="bias = Q − truth")
     ax.margins(y=0.12)
@@ -98,6 +100,33 @@ def plot_learning(records, evaluations, random=None, ax=None, title=""):
     thousands(ax)
     legend_below(ax)
     return ax
+
+
+def plot_ablations(runs, whole, axes=None, title=""):
+    """What becomes of the return when one part is taken out: a panel for each part.
+
+    runs: a dict from a panel's title to (steps (M,), returns (S, M)), a thin line for
+    each of S seeds and their mean; whole: (steps, returns) with nothing taken out, its
+    mean alone, in every panel.
+    """
+    if axes is None:
+        figure, axes = plt.subplots(1, len(runs), figsize=(6.8, 2.5), sharey=True,
+                                    layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    for ax, (name, (steps, returns)) in zip(axes, runs.items(), strict=True):
+        # Pale and without smooth edges: few colours, a small file.
+        ax.plot(steps, returns.T, color=pale(WRONG["color"], 0.7), linewidth=0.7,
+                antialiased=False)
+        ax.plot(whole[0], whole[1].mean(axis=0), linewidth=1.8, label="whole DDPG",
+                **STYLE["DDPG"])
+        ax.plot(steps, returns.mean(axis=0), label="one part missing", **WRONG)
+        ax.set_title(f"{name} (n = {len(returns)})", loc="center", fontsize=9)
+        ax.set(xlabel="environment steps")
+        ax.xaxis.set_major_locator(plt.MaxNLocator(3))
+        thousands(ax)
+    axes[0].set_ylabel("return of an episode")
+    axes[-1].legend(loc="lower right")
+    return axes
 
 
 def plot_filmstrip(pictures, ax=None, title="", count=10, dt=0.05):

@@ -48,7 +48,7 @@ def plot_true_q(position, action, q, lines, axes=None, title=""):
     hill.tick_params(pad=-3)
     hill.grid(False)
     for axis, name in zip((hill.xaxis, hill.yaxis, hill.zaxis),
-                          ("position", "action", "true Q")):
+                          ("position", "action", "")):  # the colour bar says "true Q"
         axis.set_label_text(name)
         axis.labelpad = -6
         axis.pane.set_visible(False)

@@ -1,0 +1,198 @@
+"""The classroom: what checks say, and exercises that are made from their solutions.
+
+A check cell of an exercise calls
+
+| call | passes if | else |
+|---|---|---|
+| `claim(ok, sentence)` | `ok` is true | AssertionError with the sentence |
+| `close(value, expected, name)` | shape and numbers agree | ... with the numbers |
+
+The one source of an exercise is `solutions/NN_name.ipynb`. From it
+
+    python -m dnddpg_minimal.classroom generate      writes exercises/NN_name.ipynb
+    python -m dnddpg_minimal.classroom course DIR    makes a course folder for nbgrader
+
+both with nbgrader's own preprocessors and two of ours: `NumberedStubs` (a stub names
+its exercise) and `RemoveSolutionCells` (cells with the tag `solution` go).
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+SOLUTION_TAG = "solution"  # a cell for the lecturer: analysis, tempting wrong answers
+COURSE = '''"""What nbgrader needs to know about this course."""
+
+from dnddpg_minimal.classroom import student_version
+
+c = get_config()  # noqa: F821 (nbgrader defines it)
+c.CourseDirectory.course_id = "dnddpg_minimal"
+c.GenerateAssignment.preprocessors = student_version(save=True)
+c.ExecutePreprocessor.timeout = 60  # seconds for one cell
+'''
+
+
+# --- What a check says ----------------------------------------------------------------
+
+
+def claim(ok, sentence):
+    """AssertionError with the sentence, unless `ok`. It should say what is wrong."""
+    if not ok:
+        raise AssertionError(sentence)
+
+
+def close(value, expected, name, atol=1e-6, rtol=0.0, mistakes=None):
+    """AssertionError, in words and numbers, unless `value` is what was expected.
+
+    value: what the student's code returned; expected: an array or a number. `name`
+    stands at the beginning of the sentence. Shapes must be equal, nothing is broadcast.
+    mistakes: {sentence: what one gets by this mistake}; the sentence is added where
+    the value is that of the mistake.
+    """
+    expected = np.asarray(expected, float)
+    if value is None:
+        raise AssertionError(f"{name} is None. Does your function end in `return`?")
+    try:
+        value = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise AssertionError(f"{name} is a {type(value).__name__}: expected numbers of "
+                             f"shape {expected.shape}.") from None
+
+    def same(other):
+        return value.shape == other.shape and np.allclose(value, other, rtol, atol)
+
+    if same(expected):
+        return
+    for sentence, wrong in (mistakes or {}).items():
+        if same(np.asarray(wrong, float)):
+            raise AssertionError(f"{_difference(value, expected, name)} {sentence}")
+    raise AssertionError(_difference(value, expected, name))
+
+
+def _difference(value, expected, name):
+    """One sentence: the shapes, or the worst of the numbers."""
+    if value.shape != expected.shape:
+        return f"{name} has shape {value.shape}: expected {expected.shape}."
+    if not np.isfinite(value).all():
+        return f"{name} holds {value[~np.isfinite(value)][0]}: expected finite numbers."
+    if value.ndim == 0:
+        return f"{name} is {value:.6g}: expected {expected:.6g}."
+    worst = np.unravel_index(np.abs(value - expected).argmax(), value.shape)
+    place = ", ".join(map(str, worst))
+    return (f"{name} has {value[worst]:.6g} at [{place}]: expected "
+            f"{expected[worst]:.6g}.")
+
+
+# --- Exercises from solutions ---------------------------------------------------------
+
+
+def number_of(grade_id):
+    """"exercise-1-2", "check-1-2b", "given-1-2" → "1.2"; None for any other name."""
+    found = re.fullmatch(r"(?:exercise|check|given)-(\d+)-(\d+)[a-z]?", str(grade_id))
+    return f"{int(found[1])}.{found[2]}" if found else None
+
+
+def student_version(save=False):
+    """nbgrader's preprocessors that make an exercise of a solution, in their order.
+
+    With `save` the cells also go into the course's gradebook. Imports nbgrader.
+    """
+    from nbgrader import preprocessors as nbgrader
+
+    class RemoveSolutionCells(nbgrader.NbGraderPreprocessor):
+        """Analysis and tempting wrong answers are not for students."""
+
+        def preprocess(self, nb, resources):
+            nb.cells = [cell for cell in nb.cells
+                        if SOLUTION_TAG not in cell.metadata.get("tags", [])]
+            return nb, resources
+
+    class NumberedStubs(nbgrader.ClearSolutions):
+        """A stub names its exercise: `raise NotImplementedError("Exercise 1.1: ...")`.
+        """
+
+        def preprocess_cell(self, cell, resources, index):
+            number = number_of(cell.metadata.get("nbgrader", {}).get("grade_id"))
+            words = f"Exercise {number}: not done yet"
+            stub = f'# YOUR CODE HERE\nraise NotImplementedError("{words}")'
+            self.code_stub = {"python": stub}
+            return super().preprocess_cell(cell, resources, index)
+
+    return [
+        RemoveSolutionCells,
+        nbgrader.LockCells,
+        NumberedStubs,
+        nbgrader.ClearOutput,
+        nbgrader.CheckCellMetadata,
+        nbgrader.ComputeChecksums,
+        *([nbgrader.SaveCells] if save else []),
+        nbgrader.ClearHiddenTests,
+        nbgrader.ClearMarkScheme,
+        nbgrader.ComputeChecksums,
+        nbgrader.CheckCellMetadata,
+    ]
+
+
+def exercise_of(solution):
+    """The text of the exercise (.ipynb) that a solution, a path, becomes."""
+    from nbconvert.exporters import NotebookExporter
+
+    exporter = NotebookExporter()
+    for preprocessor in student_version():
+        exporter.register_preprocessor(preprocessor)
+    text, _ = exporter.from_filename(str(solution))
+    return text.rstrip("\n") + "\n"
+
+
+def generate(solutions=ROOT / "solutions", exercises=ROOT / "exercises"):
+    """Write the exercise of every solution; yield their paths."""
+    exercises.mkdir(exist_ok=True)
+    for solution in sorted(solutions.glob("*.ipynb")):
+        path = exercises / solution.name
+        path.write_text(exercise_of(solution), encoding="utf-8", newline="\n")
+        yield path
+
+
+def course(folder, solutions=ROOT / "solutions"):
+    """Make a course folder: nbgrader's configuration, and an assignment a chapter.
+
+    Raises FileExistsError if the folder holds a course already.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "nbgrader_config.py", "x", encoding="utf-8") as file:
+        file.write(COURSE)
+    for solution in sorted(solutions.glob("*.ipynb")):
+        assignment = folder / "source" / solution.stem
+        assignment.mkdir(parents=True)
+        shutil.copy(solution, assignment)
+
+
+def main(argv=None) -> int:
+    """`generate` or `course DIR`: see the module's text. Returns the exit code."""
+    match sys.argv[1:] if argv is None else argv:
+        case ["generate"]:
+            for path in generate():
+                print(path.relative_to(ROOT))
+        case ["course", folder]:
+            try:
+                course(Path(folder))
+            except OSError as error:
+                print(f"{error.filename}: {error.strerror}", file=sys.stderr)
+                return 2
+            print(f"A course of {len(list(Path(folder, 'source').iterdir()))} "
+                  f"assignments in {folder}. Next: solutions/README.md")
+        case _:
+            print("python -m dnddpg_minimal.classroom generate | course DIR",
+                  file=sys.stderr)
+            return 2
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

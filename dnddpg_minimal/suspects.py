@@ -1,0 +1,122 @@
+"""Chapter 12's line-up: six faulty agents under letters, and a check that keeps quiet.
+
+    load(letter, what)    what was recorded of the agent behind a letter
+    check(letter, name)   one sentence: right; wrong, and why that name does not fit; or
+                          no answer yet
+    SUSPECTS              the names to choose from: what each of them did
+
+Which fault hides behind which letter is written nowhere: the letters are dealt out in
+the order of a hash, and an answer is compared by its hash. Reading this file gives
+nothing away. (Computing hashes does. So does looking up the answer; both are allowed,
+neither teaches anything.)
+"""
+
+import hashlib
+
+from dnddpg_minimal import records
+from dnddpg_minimal.bugs import BUGS
+
+LETTERS = "ABCDEF"
+SALT = "hear it"  # decides who gets which letter
+ANSWERS = {  # letter: the hash of its right answer
+    "A": "8eab835b6ce5630f951d982815571a51467631bfd06eca8450a68d4ec1f36f08",
+    "B": "042edda6049365989318c4b2970069030eb590e38150e2f99f11005ba1618749",
+    "C": "1f88e52ccf6351499c2c4a55de73e3f549ceaba57cecb1db3a837e77a0ba0c70",
+    "D": "9e19331b3f65292908c010fee2141cfa18214649ede16e65d72b5906d17f74a5",
+    "E": "36e1ddbd0d8cfeb39978171ed8ab7404bb214881fd5b61d6c65038412aabf98b",
+    "F": "a06864af5d003d2cfa5cacb5261733939ca3343c0f954ec7beb915af5cdab3fb",
+}
+
+# name: (what it did, what one would then have measured). Six are guilty, four are not.
+SUSPECTS = {
+    "time_limit": (
+        "stores the time limit as an end of the world",
+        "the clock would then cut one target in 200, wherever the car or the pendulum "
+        "is at that moment. Ask where an episode's last step finds the pendulum, early "
+        "in training and late, and what is lost by cutting there"),
+    "one_seed": (
+        "starts every episode from the same state",
+        "all episodes of training would then begin alike, and their returns would "
+        "hardly differ. Look at the spread of the returns in training, and at tests "
+        "from other starts"),
+    "lost_axis": (
+        "compares q of shape (B, 1) with y of shape (B,)",
+        "every q would then be drawn to the mean of y, and Q would be nearly the same "
+        "in all states. Compare Q at starts with Q at visited states"),
+    "env_units": (
+        "stores the action in the task's units, and asks in [-1, 1]",
+        "the critic would then judge a policy with half of the torque. Ask whether it "
+        "expects too little from its own, stronger policy"),
+    "through_y": (
+        "lets the gradient flow through y, with no slow copies",
+        "a part of the error that all states share would then die very slowly, while "
+        "the loss looks small. Look at how long Q stays near its first values"),
+    "no_end": (
+        "forgets that the world ended: every target goes on",
+        "Q would then be fed by its own guess about states that nobody leaves. That "
+        "needs a task whose world can end, and the error has a size of its own"),
+    "no_noise": (
+        "does not explore after the first 1 000 steps",
+        "training would then show the same returns as tests, step by step, since both "
+        "act without noise"),
+    "no_replay": (
+        "learns from the newest transitions only",
+        "the critic would then forget whatever it has not just seen, and the returns "
+        "would jump up and down until the end"),
+    "no_slow_copy": (
+        "computes y with the networks that learn",
+        "targets would then run after themselves: learning starts, and breaks down "
+        "again and again, with Q far from the truth in either direction"),
+    "none": (
+        "did nothing wrong",
+        "one instrument would then have to read as that of the right agent. Not all "
+        "of them do"),
+}
+
+
+def _hash(*words):
+    return hashlib.sha256(":".join((SALT, *words)).encode()).hexdigest()
+
+
+def _dealt():
+    """The faults in the order of the letters."""
+    return sorted(BUGS, key=_hash)
+
+
+def load(letter, what="evaluations", folder=None):
+    """`records.load_study` of the agent behind a letter; its variant reads `letter`.
+
+    Raises ValueError for an unknown letter.
+    """
+    fault = _dealt()[_place(letter)]
+    found = records.load_study(algorithm="DDPG", variant=f"bug={fault}", what=what,
+                               folder=folder)
+    if isinstance(found, list):
+        return [one | {"variant": letter} for one in found]
+    return found.assign(variant=letter)
+
+
+def task_of(letter):
+    """The task on which the agent behind a letter was trained."""
+    return BUGS[_dealt()[_place(letter)]][0]
+
+
+def _place(letter):
+    if letter not in LETTERS or len(letter) != 1:
+        raise ValueError(f"letter={letter!r}: expected one of {', '.join(LETTERS)}.")
+    return LETTERS.index(letter)
+
+
+def check(letter, name=None):
+    """One sentence about the answer `name` for a letter. Tells no right answer.
+
+    Raises ValueError for a letter or a name that does not exist.
+    """
+    _place(letter)
+    if name is None:
+        return "no answer yet"
+    if name not in SUSPECTS:
+        raise ValueError(f"name={name!r}: expected one of {', '.join(SUSPECTS)}.")
+    if _hash(letter, name) == ANSWERS[letter]:
+        return f"right: it {SUSPECTS[name][0]}"
+    return f"not this one: {SUSPECTS[name][1]}"
