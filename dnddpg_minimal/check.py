@@ -103,7 +103,8 @@ def source_of(nb, path):
     if chapter is None and path.name[:2].isdigit():
         chapter = int(path.name[:2])
     for solution in (ROOT / "solutions").glob(f"{chapter or 0:02d}_*.ipynb"):
-        if numbers or path.name == solution.name and path.parent.name == "exercises":
+        stripped = path.parent.name == "exercises" and path.name == solution.name
+        if numbers or stripped:  # by a program that keeps no metadata
             return read(solution), (f"checks of solutions/{solution.name}, "
                                     "hidden tests included")
     if not any(is_check(cell) for cell in nb.cells):
@@ -127,7 +128,8 @@ def with_checks_of(source, nb):
         if cell.cell_type == "code":
             cells.append(cell)
             seen.add(name)
-    at = 0
+    seen.discard(None)  # cells of the student's own
+    at = 0 if seen else len(cells)
     for original in source.cells:  # what was deleted comes back in its place
         name = id_of(original)
         if name in seen:

@@ -11,13 +11,15 @@ The one source of an exercise is `solutions/NN_name.ipynb`. From it
 
     python -m dnddpg_minimal.classroom generate      writes exercises/NN_name.ipynb
     python -m dnddpg_minimal.classroom course DIR    makes a course folder for nbgrader
+    python -m dnddpg_minimal.classroom table         prints chapters, minutes, points
 
-both with nbgrader's own preprocessors and two of ours: `NumberedStubs` (a stub names
-its exercise) and `RemoveSolutionCells` (cells with the tag `solution` go).
+An exercise is made by nbgrader's own preprocessors and two of ours: `NumberedStubs` (a
+stub names its exercise) and `RemoveSolutionCells` (cells with the tag `solution` go).
 """
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import sys
@@ -173,8 +175,20 @@ def course(folder, solutions=ROOT / "solutions"):
         shutil.copy(solution, assignment)
 
 
+def table(solutions=ROOT / "solutions"):
+    """A line of a Markdown table for every solution, with its minutes and points."""
+    head = re.compile(r"^## Exercise .*\n\n.* · (\d+) minutes · (\d+) points", re.M)
+    for solution in sorted(solutions.glob("*.ipynb")):
+        cells = json.loads(solution.read_text(encoding="utf-8"))["cells"]
+        found = head.findall("\n".join("".join(cell["source"]) for cell in cells))
+        minutes, points = (sum(map(int, column)) for column in zip(*found))
+        name = solution.stem
+        yield (f"| [{name}](../exercises/{name}.ipynb) | [solution]({name}.ipynb) "
+               f"| {len(found)} | {minutes} | {points} |")
+
+
 def main(argv=None) -> int:
-    """`generate` or `course DIR`: see the module's text. Returns the exit code."""
+    """`generate`, `course DIR` or `table`, as above. Returns the exit code."""
     match sys.argv[1:] if argv is None else argv:
         case ["generate"]:
             for path in generate():
@@ -187,8 +201,10 @@ def main(argv=None) -> int:
                 return 2
             print(f"A course of {len(list(Path(folder, 'source').iterdir()))} "
                   f"assignments in {folder}. Next: solutions/README.md")
+        case ["table"]:
+            print(*table(), sep="\n")
         case _:
-            print("python -m dnddpg_minimal.classroom generate | course DIR",
+            print("python -m dnddpg_minimal.classroom generate | course DIR | table",
                   file=sys.stderr)
             return 2
     return 0

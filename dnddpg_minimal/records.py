@@ -196,9 +196,10 @@ def results(variant="class", folder=None):
 def claims(runs):
     """What the paper says, against the runs of `results`: one row per task and claim.
 
-    Differences are paired by seed; a verdict needs a 95 % t-interval on one side of 0.
+    Differences are paired by seed; a verdict needs three of them, and a 95 % t interval
+    on one side of 0.
     """
-    from scipy.stats import t
+    from dnddpg_minimal.statistics import verdict
 
     def of(name, algorithm):
         return runs[name].xs(algorithm, level="algorithm").droplevel("variant")
@@ -213,11 +214,8 @@ def claims(runs):
     for claim, values in said.items():
         for task, group in values.dropna().groupby(level="task", sort=False):
             mean, error, n = bias.summary(group)
-            width = t.ppf(0.975, n - 1) * error if n > 1 else np.inf
-            verdict = ("not distinguishable" if not abs(mean) > width else
-                       "holds" if mean > 0 else "does not hold")
             found.append(dict(task=task, claim=claim, mean=mean, error=error, n=n,
-                              verdict=verdict))
+                              verdict=verdict(group)))
     return found
 
 

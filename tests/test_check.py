@@ -82,6 +82,15 @@ def test_right_wrong_slow_and_tampered_answers_in_one_notebook(tmp_path, capsys)
     assert lines[8:] == ["Together: 2 of 14 points"]
 
 
+def test_the_whole_notebook_has_a_time_limit(tmp_path, capsys):
+    slow = "import time\n\ntime.sleep(60)\n"
+    path = handed_in(tmp_path, exercise_1_1=slow, exercise_1_2=slow)
+    assert main(["check", str(path), "--total", "3"]) == 1
+    out = capsys.readouterr().out
+    assert "was not run: the time for the whole notebook was over" in out
+    assert out.endswith("Together: 0 of 14 points\n")
+
+
 def test_without_solutions_a_changed_check_earns_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(check, "ROOT", tmp_path)
     path = handed_in(tmp_path, check_1_2="assert True")
@@ -105,7 +114,12 @@ def prepared(path):
 
 def test_hidden_tests_given_code_and_the_order_of_cells_are_restored(tmp_path):
     path = handed_in(tmp_path, given_1_4="gamma = 0", check_1_3="", check_1_2=None)
-    cells, changed = prepared(path)
+    nb = content(path)  # and the student has tried something at the end
+    nb["cells"].append({"cell_type": "code", "id": "mine", "metadata": {},
+                        "outputs": [], "execution_count": 1, "source": "1 + 1"})
+    path.write_text(json.dumps(nb), encoding="utf-8")
+    (*cells, mine), changed = prepared(path)
+    assert mine.source == "1 + 1"
     original, _ = prepared(SOLUTION)
     assert [check.id_of(cell) for cell in cells] == [
         check.id_of(cell) for cell in original]
@@ -131,6 +145,19 @@ def test_a_notebook_is_known_by_its_checks_not_by_its_name(tmp_path):
     assert "solutions/01_value.ipynb" in check.source_of(nb, path)[1]
 
 
+def test_a_notebook_that_lost_its_metadata_gets_the_checks_at_its_end(tmp_path):
+    nb = content(EXERCISE)
+    for cell in nb["cells"]:
+        cell["metadata"] = {}
+    path = tmp_path / "exercises" / "01_value.ipynb"
+    path.parent.mkdir()
+    path.write_text(json.dumps(nb), encoding="utf-8")
+    cells, _ = prepared(path)
+    original = [cell for cell in check.read(SOLUTION).cells if check.is_locked(cell)]
+    assert [cell.source for cell in cells[-len(original):]] == [
+        cell.source for cell in original]
+
+
 @pytest.mark.parametrize("text, words", [
     ("{\"cells\": [", "is no notebook, or damaged"),
     ("[1, 2]", "holds no list of cells"),
@@ -148,7 +175,8 @@ def test_a_damaged_file_gets_one_line_and_exit_code_2(tmp_path, capsys, text, wo
     assert words in shown.err and "a.ipynb" in shown.err
 
 
-def test_no_such_file_gets_one_line_and_exit_code_2(tmp_path, capsys):
-    for path in (tmp_path / "nowhere.ipynb", tmp_path):
-        assert main(["check", str(path)]) == 2
+def test_no_such_file_and_no_time_get_one_line_and_exit_code_2(tmp_path, capsys):
+    for words in ([tmp_path / "nowhere.ipynb"], [tmp_path],
+                  [EXERCISE, "--seconds", "0"]):
+        assert main(["check", *map(str, words)]) == 2
         assert capsys.readouterr().err.count("\n") == 1

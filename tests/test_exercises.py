@@ -120,6 +120,23 @@ def test_an_exercise_has_stars_minutes_why_hints_a_check_and_a_stretch(solution)
     assert kinds <= {"derive and code", "find the silent bug", "predict, then measure"}
 
 
+def test_the_lecturers_table_says_the_minutes_and_points_of_each_chapter():
+    guide = (ROOT / "solutions" / "README.md").read_text(encoding="utf-8")
+    for line in classroom.table():
+        assert line in guide.splitlines(), (
+            "print the lines: python -m dnddpg_minimal.classroom table")
+    assert guide.count("[solution](") == len(SOLUTIONS)
+
+
+def test_a_course_is_made_once_and_other_words_are_refused(tmp_path, capsys):
+    assert classroom.main(["course", str(tmp_path / "course")]) == 0
+    made = {path.parent.name for path in (tmp_path / "course").rglob("*.ipynb")}
+    assert made == {path.stem for path in SOLUTIONS}
+    assert classroom.main(["course", str(tmp_path / "course")]) == 2
+    assert "exists" in capsys.readouterr().err
+    assert classroom.main(["generat"]) == 2
+
+
 # --- What passes, and what does not ---------------------------------------------------
 
 
@@ -179,16 +196,18 @@ def test_every_stub_fails_by_its_own_number_and_the_other_cells_run(solution):
 
 
 def told(source):
-    """The lines of a text that say something: neither short, nor an import, nor a text.
-    """
+    """The lines of a text that say something: not the short ones, no imports."""
     lines = (line.split("  #")[0].strip() for line in source.splitlines())
     return {line for line in lines
             if len(line) > 12 and not line.startswith(("from ", "import "))}
 
 
-@each_solution
-def test_no_solution_hidden_test_or_output_leaks_into_the_exercise(solution):
-    secret, open_ = set(), set()
+def leaks(solution, exercise):
+    """Lines of answers, hidden tests and lecturer's cells that stand in the exercise.
+
+    What also stands in code for everybody is no secret.
+    """
+    secret, known = set(), set()
     for cell in read(solution).cells:
         source = cell.source
         if classroom.SOLUTION_TAG in cell.metadata.get("tags", []):
@@ -198,16 +217,39 @@ def test_no_solution_hidden_test_or_output_leaks_into_the_exercise(solution):
             for hidden in marker.findall(source):
                 secret |= told(hidden)
             source = marker.sub("", source)
-        if cell.cell_type == "code":  # a line that students are given is no secret
-            open_ |= told(source)
+        if cell.cell_type == "code":
+            known |= told(source)
+    secret = {line for line in secret if not any(line in other for other in known)}
+    assert secret
+    exercise = json.loads(exercise)
+    for cell in exercise["cells"]:
+        cell["source"] = "".join(cell["source"])
+    text = json.dumps(exercise, ensure_ascii=False)
+    return {line for line in secret
+            if json.dumps(line, ensure_ascii=False)[1:-1] in text}
+
+
+@each_solution
+def test_no_answer_hidden_test_or_analysis_leaks_into_the_exercise(solution):
+    exercise = exercise_of(solution)
+    assert leaks(solution, exercise) == set()
+    assert "### BEGIN" not in exercise and "### END" not in exercise
+
+
+@pytest.mark.parametrize("place", ["source", "metadata", "outputs", "of the notebook"])
+def test_a_leak_would_be_seen(place):
+    solution, answer = SOLUTIONS[0], "after = reward[t] + gamma * after"
     exercise = json.loads(exercise_of(solution))
-    cells = [cell | {"source": "".join(cell["source"])} for cell in exercise["cells"]]
-    text = json.dumps(exercise | {"cells": cells}, ensure_ascii=False)
-    assert secret - open_
-    leaks = [line for line in secret - open_ if json.dumps(
-        line, ensure_ascii=False)[1:-1] in text]
-    assert leaks == []
-    assert "BEGIN " not in text and "END " not in text
+    cell = next(cell for cell in exercise["cells"] if cell["cell_type"] == "code")
+    if place == "source":
+        cell["source"] += ["\n", f"    {answer}\n"]
+    elif place == "metadata":
+        cell["metadata"]["note"] = [answer]
+    elif place == "outputs":
+        cell["outputs"] = [{"output_type": "stream", "name": "stdout", "text": answer}]
+    else:
+        exercise["metadata"]["kept"] = {"answer": answer}
+    assert leaks(solution, json.dumps(exercise)) == {answer}
 
 
 @each_solution

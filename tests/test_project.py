@@ -206,3 +206,27 @@ def test_the_docstring_of_an_exported_function_names_its_arguments(name):
     missing = [word for word in inspect.signature(thing).parameters
                if word not in said and symbols.get(word, word) not in said]
     assert not missing
+
+
+# --- the book's links -----------------------------------------------------------------
+
+BOOK = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def title_of(notebook):
+    first = json.loads(notebook.read_text(encoding="utf-8"))["cells"][0]["source"]
+    number, title = "".join(first).splitlines()[0].lstrip("# ").split(" · ")
+    assert notebook.name.startswith(number)
+    return f"{number} {title}"
+
+
+@pytest.mark.parametrize("notebook", BOOK, ids=lambda path: path.stem)
+def test_a_chapter_calls_the_others_by_their_names(notebook):
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    text = "\n".join("".join(cell["source"]) for cell in cells
+                     if cell["cell_type"] == "markdown")
+    for words, target in re.findall(r"\[([^\]]*)\]\(([^)#]+\.ipynb)\)", text):
+        path = notebook.parent / target
+        assert path.exists(), target
+        if re.match(r"\d\d ", words) and path.parent == notebook.parent:
+            assert " ".join(words.split()) == title_of(path)

@@ -266,14 +266,22 @@ def close_figures():
 
 @pytest.mark.usefixtures("close_figures")
 def test_a_task_without_records_says_which_command_records_it():
-    curve = np.arange(3), np.ones((2, 3))
+    curve = np.arange(3), np.ones((3, 3))
     axes = plots.plot_eight_tasks({"Pendulum-v1": {"DDPG": curve}, "Hopper-v5": {}},
                                   interval=st.t_interval, seeds=True)
     drawn, empty = np.ravel(axes)
-    assert "n = 2" in drawn.get_title(loc="left") and len(drawn.get_lines()) == 3
+    assert "n = 3" in drawn.get_title(loc="left")
+    assert len(drawn.get_lines()) == 4 and len(drawn.collections) == 1  # runs, mean
     words = "".join(text.get_text() for text in empty.texts).split()
     assert " ".join(words) == ("not recorded yet: python -m dnddpg_minimal study "
                                "--task Hopper-v5")
+
+
+@pytest.mark.usefixtures("close_figures")
+def test_fewer_than_three_runs_have_no_shade():
+    curve = np.arange(3), np.ones((2, 3))
+    axes = plots.plot_eight_tasks({"Pendulum-v1": {"DDPG": curve}}, st.t_interval)
+    assert len(axes[0, 0].collections) == 0
 
 
 @pytest.mark.usefixtures("close_figures")

@@ -5,6 +5,7 @@ import numpy as np
 
 from dnddpg_minimal.plots.style import ONE, STYLE, THREE, TRUTH, TWO, pale, thousands
 
+FEWEST = 3  # runs for an interval, as in statistics.py
 VERDICTS = {  # first words of a verdict: colour of its field, colour of its text
     "holds": ("#0072B2", "white"),
     "does not hold": ("#D55E00", "white"),
@@ -19,8 +20,8 @@ def plot_eight_tasks(curves, interval=None, seeds=False, limits=None, xlabel="",
 
     curves: a dict from a task to a dict from an algorithm to (x (M,), values (S, M));
     a task without algorithms gets an empty panel that says how to record it. interval:
-    a function of values that gives (low, high), drawn as a shade; seeds: every run as a
-    thin line.
+    a function of values that gives (low, high), drawn as a shade from 3 runs on; seeds:
+    every run as a thin line; limits: a dict from a task to its axis' (low, high).
     """
     if axes is None:
         rows = -(-len(curves) // 4)
@@ -41,7 +42,7 @@ def plot_eight_tasks(curves, interval=None, seeds=False, limits=None, xlabel="",
             not_recorded(ax, task)
         for name, (x, values) in of_algorithms.items():
             style = STYLE[name]
-            if interval is not None and len(values) > 1:
+            if interval is not None and len(values) >= FEWEST:
                 ax.fill_between(x, *interval(values), color=pale(style["color"], 0.6),
                                 alpha=0.55, linewidth=0, antialiased=False)
             if seeds:  # without smooth edges: few colours, a small file
@@ -137,8 +138,8 @@ def plot_paired_by_task(differences, axes=None, title="", xlabel=""):
     """Paired differences, task by task: a ring per seed, the mean, two intervals.
 
     differences: a dict from a pair's name to a dict from a task to (values (n,) in %, t
-    interval, bootstrap interval); an interval that is NaN is not drawn. Tasks without
-    values are left empty. The axis is linear within ±1 and logarithmic beyond.
+    interval, bootstrap interval). Fewer than 3 values: rings only. The axis is linear
+    within ±1 and logarithmic beyond.
     """
     if axes is None:
         rows = max(map(len, differences.values()))
@@ -152,9 +153,9 @@ def plot_paired_by_task(differences, axes=None, title="", xlabel=""):
         for n, (values, t, bootstrap) in enumerate(tasks.values()):
             ax.plot(values, np.full(len(values), n + 0.3), "o", markersize=3.5,
                     markerfacecolor="white", markeredgecolor="0.45")
-            ax.plot(t, [n, n], color="black", linewidth=1.6)
-            ax.plot(bootstrap, [n - 0.27] * 2, color=ONE["color"], linewidth=1.6)
-            if len(values) > 1:
+            if len(values) >= FEWEST:
+                ax.plot(t, [n, n], color="black", linewidth=1.6)
+                ax.plot(bootstrap, [n - 0.27] * 2, color=ONE["color"], linewidth=1.6)
                 ax.plot(np.mean(values), n, "D", color="black", markersize=4.5)
         ax.set_xscale("symlog", linthresh=1, linscale=0.8)
         ax.xaxis.set_minor_locator(plt.NullLocator())
@@ -166,8 +167,9 @@ def plot_paired_by_task(differences, axes=None, title="", xlabel=""):
                     for found in tasks.values()), default=1)
     ticks = [t for t in (1, 10, 100, 1000) if t <= 1.5 * furthest]
     ticks = [-t for t in reversed(ticks)] + [0] + ticks
-    np.ravel(axes)[0].set_xticks(ticks, [f"{t:+d}".replace("-", "−") if t else "0"
-                                         for t in ticks])
+    np.ravel(axes)[0].set_xticks(ticks, [str(t).replace("-", "−") for t in ticks])
+    for ax in np.ravel(axes):
+        ax.tick_params(axis="x", labelsize=7)
     return axes
 
 

@@ -105,14 +105,14 @@ def plot_climbing(predicted, measured, best, usual, axes=None, title=""):
     axes[1].plot(theta, share, "o-", markersize=5,
                  markerfacecolor="white", color=ONE["color"])
     axes[1].set(ylim=(-4, 104), ylabel="episodes that arrive (%)")
-    axes[1].annotate("white\nnoise", (theta[-1], share[-1]), xytext=(3, 9),
+    axes[1].annotate("no\nmemory", (theta[-1], share[-1]), xytext=(3, 9),
                      textcoords="offset points", ha="center", fontsize=8.5)
     for ax, name in zip(axes, ("closed form", "simulated")):
         ax.set(xscale="log", xlabel="θ  (short memory →)")
         ax.set_title(name, loc="center", fontsize=9)
         for value, text, style in ((best, "θ = ω", "--"), (usual, "usual", ":")):
             ax.axvline(value, color="black", linestyle=style, linewidth=1, zorder=0)
-            ax.annotate(text, (value, 0.03), xycoords=("data", "axes fraction"),
+            ax.annotate(text, (value, 0.2), xycoords=("data", "axes fraction"),
                         xytext=(-2, 0) if text != "usual" else (2, 0),
                         textcoords="offset points", rotation=90, fontsize=8.5,
                         ha="right" if text != "usual" else "left", va="bottom")
