@@ -28,8 +28,8 @@ def main(argv=None) -> int:
     return tyro.cli(command, args=argv, prog="python -m dnddpg_minimal check")
 
 
-def command(notebook: Annotated[Path, tyro.conf.Positional], seconds: float = 60,
-            total: float = 300) -> int:
+def command(notebook: Annotated[Path, tyro.conf.Positional], seconds: int = 60,
+            total: int = 300) -> int:
     """Run an exercise notebook afresh; print its points, and what is wrong.
 
     Args:
@@ -37,6 +37,8 @@ def command(notebook: Annotated[Path, tyro.conf.Positional], seconds: float = 60
         seconds: time limit of one cell. A cell that takes longer is left out.
         total: time limit of the whole notebook.
     """
+    if min(seconds, total) < 1:
+        raise ValueError(f"--seconds {seconds} --total {total}: expected 1 or more")
     nb = read(notebook)
     source, where = source_of(nb, notebook)
     cells, changed = with_checks_of(source, nb)
@@ -167,14 +169,15 @@ def run(cells, folder, seconds, total):
             for index, cell in enumerate(cells):
                 if index in left_out:
                     continue
-                client.timeout = min(seconds, end - time.monotonic())
-                if client.timeout <= 0:
+                left = int(end - time.monotonic())  # nbclient wants whole seconds
+                if left < 1:
                     errors[index] = "", NOT_RUN
                     continue
+                client.timeout = min(seconds, left)
                 try:
                     client.execute_cell(cell, index)
                 except CellTimeoutError:
-                    left_out[index] = "", f"ran longer than {client.timeout:.0f} s"
+                    left_out[index] = "", f"ran longer than {client.timeout} s"
                     break
                 except DeadKernelError:
                     left_out[index] = "", "ended the kernel"
