@@ -227,8 +227,8 @@ def plot_live(episodes, evaluations, q, truth, random, axes=None, title=""):
     episodes, evaluations, random: as in `plot_learning`; q, truth: as in `plot_kept`.
     """
     if axes is None:
-        figure, axes = plt.subplots(1, 2, figsize=(7.4, 3), dpi=80,
-                                    layout="constrained", width_ratios=(5, 4))
+        figure, axes = plt.subplots(1, 2, figsize=(7.4, 3), layout="constrained",
+                                    width_ratios=(5, 4))
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     plot_learning(episodes, evaluations, random, ax=axes[0])
     axes[0].legend(loc="upper left", fontsize=8)
