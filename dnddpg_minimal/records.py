@@ -155,7 +155,8 @@ def score(table, column="mean"):
     def last(runs):
         return runs.tail(5 if runs.name[0] in MUJOCO_TASKS else 10).mean()
 
-    return table.sort_values("step").groupby([*RUN], sort=False)[column].apply(last)
+    in_order = table.sort_values("step", kind="stable")
+    return in_order.groupby([*RUN], sort=False)[column].apply(last)
 
 
 def load_agent_at(weights, i=-1):

@@ -41,15 +41,15 @@ def plot_eight_tasks(curves, interval=None, seeds=False, limits=None, xlabel="",
         if not of_algorithms:
             not_recorded(ax, task)
         for name, (x, values) in of_algorithms.items():
-            style = STYLE[name]
+            style = STYLE[name]  # lines without smooth edges: few colours, a small file
             if interval is not None and len(values) >= FEWEST:
                 ax.fill_between(x, *interval(values), color=pale(style["color"], 0.6),
                                 alpha=0.55, linewidth=0, antialiased=False)
-            if seeds:  # without smooth edges: few colours, a small file
+            if seeds:
                 ax.plot(x, values.T, color=pale(style["color"], 0.45), linewidth=0.4,
                         antialiased=False)
-            ax.plot(x, values.mean(axis=0), linewidth=1.5, zorder=3, label=name,
-                    **style)
+            ax.plot(x, values.mean(axis=0), linewidth=1.2, zorder=3, label=name,
+                    antialiased=False, **style)
         if of_algorithms:
             ax.xaxis.set_major_locator(plt.MaxNLocator(2))
             ax.yaxis.set_major_locator(plt.MaxNLocator(3))
@@ -138,8 +138,8 @@ def plot_paired_by_task(differences, axes=None, title="", xlabel=""):
     """Paired differences, task by task: a ring per seed, the mean, two intervals.
 
     differences: a dict from a pair's name to a dict from a task to (values (n,) in %, t
-    interval, bootstrap interval). Fewer than 3 values: rings only. The axis is linear
-    within ±1 and logarithmic beyond.
+    interval, bootstrap interval), in the colours of `plot_coverage`. Fewer than 3
+    values: rings only. The axis is linear within ±1 and logarithmic beyond.
     """
     if axes is None:
         rows = max(map(len, differences.values()))
@@ -154,8 +154,8 @@ def plot_paired_by_task(differences, axes=None, title="", xlabel=""):
             ax.plot(values, np.full(len(values), n + 0.3), "o", markersize=3.5,
                     markerfacecolor="white", markeredgecolor="0.45")
             if len(values) >= FEWEST:
-                ax.plot(t, [n, n], color="black", linewidth=1.6)
-                ax.plot(bootstrap, [n - 0.27] * 2, color=ONE["color"], linewidth=1.6)
+                ax.plot(t, [n, n], color=ONE["color"], linewidth=2)
+                ax.plot(bootstrap, [n - 0.27] * 2, color=TWO["color"], linewidth=2)
                 ax.plot(np.mean(values), n, "D", color="black", markersize=4.5)
         ax.set_xscale("symlog", linthresh=1, linscale=0.8)
         ax.xaxis.set_minor_locator(plt.NullLocator())
