@@ -31,9 +31,9 @@ ANSWERS = {  # letter: the hash of its right answer
 SUSPECTS = {
     "time_limit": (
         "stores the time limit as an end of the world",
-        "the clock would then cut one target in 200, wherever the car or the pendulum "
-        "is at that moment. Ask where an episode's last step finds the pendulum, early "
-        "in training and late, and what is lost by cutting there"),
+        "one target in 200 would then be far from the others, Eq. (12.1): a loss "
+        "several times the right agent's, beside a return that is as good as ever. "
+        "Look at both columns together"),
     "one_seed": (
         "starts every episode from the same state",
         "all episodes of training would then begin alike, and their returns would "
@@ -41,36 +41,38 @@ SUSPECTS = {
         "from other starts"),
     "lost_axis": (
         "compares q of shape (B, 1) with y of shape (B,)",
-        "every q would then be drawn to the mean of y, and Q would be nearly the same "
-        "in all states. Compare Q at starts with Q at visited states"),
+        "every q would then be drawn to the mean of y, and Q would be the same in all "
+        "states, to a unit or two. Compare Q at starts with Q at visited states"),
     "env_units": (
         "stores the action in the task's units, and asks in [-1, 1]",
         "the critic would then judge a policy with half of the torque. Ask whether it "
         "expects too little from its own, stronger policy"),
     "through_y": (
         "lets the gradient flow through y, with no slow copies",
-        "a part of the error that all states share would then die very slowly, while "
-        "the loss looks small. Look at how long Q stays near its first values"),
+        "the loss would then be smaller than the right agent's, for y is moved towards "
+        "q, and yet little would be learned for most of the run, in practice as in "
+        "tests. Look at the loss and at practice together"),
     "no_end": (
         "forgets that the world ended: every target goes on",
         "Q would then be fed by its own guess about states that nobody leaves. That "
-        "needs a task whose world can end, and the error has a size of its own"),
+        "needs a task whose world can end, and Q leaves all that the task can pay"),
     "no_noise": (
         "does not explore after the first 1 000 steps",
-        "training would then show the same returns as tests, step by step, since both "
-        "act without noise"),
+        "every column would then read nearly as that of the right agent: on Pendulum "
+        "this noise is hardly needed (chapter 03). Find the column that does not"),
     "no_replay": (
         "learns from the newest transitions only",
-        "the critic would then forget whatever it has not just seen, and the returns "
-        "would jump up and down until the end"),
+        "the critic would then forget whatever it has not just seen: Q far above the "
+        "truth, with a loss no larger than the right agent's, since the newest rows "
+        "are easy to fit. Compare Q, truth and loss"),
     "no_slow_copy": (
         "computes y with the networks that learn",
-        "targets would then run after themselves: learning starts, and breaks down "
-        "again and again, with Q far from the truth in either direction"),
+        "targets would then run after themselves: a loss many times the right agent's, "
+        "and a return that rises and breaks down again and again. Look at both"),
     "none": (
         "did nothing wrong",
-        "one instrument would then have to read as that of the right agent. Not all "
-        "of them do"),
+        "every instrument would then read as that of the right agent on the same task. "
+        "Find the one that does not"),
 }
 
 

@@ -296,7 +296,7 @@ def arm_explorer(folder=None):
             left=0.01, right=0.98, bottom=0.04, top=0.9, wspace=0.6))
         plots.plot_arm(state[0], seen["paths"], seen["q"], axes)
         return (f"Finger {seen['distance']:.0f} px from the goal's centre: reward "
-                f"{seen['reward']:+.3f}. " + proposals_in_words(seen),
+                f"{seen['reward']:+.3f}.", proposals_in_words(seen),
                 "Observation: " + ", ".join(f"{x:+.2f}" for x in seen["obs"]) + ".")
 
     names = list(agents)
@@ -310,7 +310,7 @@ def arm_explorer(folder=None):
         "goal_x": slider("goal x, px in the window", 100.0, 0.0, 400.0, 5.0),
         "goal_y": slider("goal y, px in the window", 100.0, 0.0, 400.0, 5.0),
     }
-    return panel("the arm explorer", controls, draw, size=(7.6, 2.9), lines=2)
+    return panel("the arm explorer", controls, draw, size=(7.6, 2.9), lines=3)
 
 
 def recorded_arm_agents(folder=None):
@@ -391,7 +391,7 @@ def figure_6_explorer(folder=None):
         table = tables.get((task, AXES[axis]))
         if table is None:
             return (f"{task}: not recorded yet. python -m dnddpg_minimal study "
-                    f"--task {task}")
+                    f"--task {task}", "Nothing is drawn.")
         of_interval = getattr(statistics, INTERVALS[interval])
         found = statistics.scores(table, SCORES[score]).loc[task]
         left, right = figure.subplots(1, 2, width_ratios=(1.5, 1), gridspec_kw=dict(
@@ -415,15 +415,17 @@ def figure_6_explorer(folder=None):
         d = statistics.paired(found, "DN-DDPG", "DDPG")
         said = statistics.verdict(d)
         if len(d) < statistics.FEWEST:
-            return f"{task}: DN-DDPG better than DDPG: {said}."
-        low, high = statistics.t_interval(d)
-        return (f"{task}, n = {len(d)}: DN − DDPG {d.mean():+.3g}, t interval "
-                f"[{low:+.3g}, {high:+.3g}]; “DN-DDPG is better”: {said}.")
+            found = f"{task}: DN-DDPG better than DDPG: {said}."
+        else:
+            low, high = statistics.t_interval(d)
+            found = (f"{task}, n = {len(d)}: DN − DDPG {d.mean():+.3g}, t interval "
+                     f"[{low:+.3g}, {high:+.3g}]; “DN-DDPG is better”: {said}.")
+        return found, f"Drawn: {axis}; shade: {interval}; score: {score}."
 
     return panel("the Figure 6 explorer", {
         "task": menu("task", TASKS), "axis": menu("axis", AXES),
         "interval": menu("interval", INTERVALS), "score": menu("score", SCORES),
-    }, draw, size=(7.4, 2.9))
+    }, draw, size=(7.4, 2.9), lines=2)
 
 
 def draw_curve(ax, x, values, of_interval, style, name):

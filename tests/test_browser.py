@@ -102,11 +102,12 @@ def open_and_run(page, url, theme):
     """Open a chapter, run all its cells, and wait until the kernel rests."""
     page.goto(url)
     page.wait_for_selector("text=| Idle", timeout=120_000)
-    if theme == "Dark":
+    light = "true" if theme == "Light" else "false"
+    if page.locator(f"body[data-jp-theme-light='{light}']").count() == 0:
         page.click(".lm-MenuBar-itemLabel:text-is('Settings')")
         page.hover(".lm-Menu-itemLabel:text-is('Theme')")
-        page.click(".lm-Menu-itemLabel:text-is('JupyterLab Dark')")
-        page.wait_for_selector("body[data-jp-theme-light='false']", state="attached")
+        page.click(f".lm-Menu-itemLabel:text-is('JupyterLab {theme}')")
+        page.wait_for_selector(f"body[data-jp-theme-light='{light}']", state="attached")
     page.click(".lm-MenuBar-itemLabel:text-is('Run')")
     page.click(".lm-Menu-itemLabel:text-is('Run All Cells')")
     idle = page.locator("text=| Idle")
@@ -173,7 +174,7 @@ def test_a_chapter_runs_in_a_browser_and_its_panels_answer(path, lab, page):
     expected = len(re.findall(r"widgets\.\w+(?:laboratory|explorer)\(", source))
     found = panels(page)
     explorers = [i for i in range(found.count())
-                 if found.nth(i).locator(".noUi-handle").count()]
+                 if found.nth(i).locator(".noUi-handle, select").count()]
     assert len(explorers) >= expected
     for i in explorers:
         assert move_every_control(page, found.nth(i)) > 0
@@ -210,4 +211,6 @@ def test_the_live_training_panel_starts_pauses_goes_on_and_stops(lab, page):
     wait_until(lambda: any("Over at" in text for text in
                            panel.locator(".widget-label").all_inner_texts()), 30,
                "the run does not stop")
+    panel.scroll_into_view_if_needed()
+    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
     page.screenshot(path=SCREENSHOTS / "live_training.png")

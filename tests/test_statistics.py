@@ -301,4 +301,4 @@ def test_a_single_difference_is_drawn_without_a_mean_and_without_an_interval():
         task: (d, st.t_interval(d), st.bootstrap_interval(d))
         for task, d in (("Pendulum-v1", one), ("Hopper-v5", none))}}
     (ax,) = np.ravel(plots.plot_paired_by_task(found))
-    assert "D" not in [line.get_marker() for line in ax.get_lines()]
+    assert "|" not in [line.get_marker() for line in ax.get_lines()]

@@ -151,8 +151,9 @@ def plot_fastest(steps, start, ends, counts, axes=None, title=""):
                      xytext=(6, 4), textcoords="offset points")
     for end, count, style in zip(ends, counts, PROPOSALS):
         draw_arm(axes[1], end, colour=style["color"], alpha=0.8)
-        elbow = arm.locate(end[None, :2])[0, 0]
-        axes[1].annotate(f"{count:.0f} steps", 1.12 * elbow, ha="center", va="center",
+        elbow, finger = arm.locate(end[None, :2])[0]
+        beside = elbow + 0.5 * (elbow - finger / 2)  # on the outer side of the elbow
+        axes[1].annotate(f"{count:.0f} steps", beside, ha="center", va="center",
                          fontsize=8.5)
     return axes
 

@@ -26,7 +26,7 @@ def plot_eight_tasks(curves, interval=None, seeds=False, limits=None, xlabel="",
     if axes is None:
         rows = -(-len(curves) // 4)
         figure, axes = plt.subplots(rows, min(4, len(curves)), squeeze=False,
-                                    figsize=(7, 1.55 * rows + 0.4),
+                                    figsize=(7, 1.55 * rows + 0.4), dpi=82,
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
         figure.supxlabel(xlabel, fontsize=9)
@@ -156,13 +156,15 @@ def plot_paired_by_task(differences, axes=None, title="", xlabel=""):
             if len(values) >= FEWEST:
                 ax.plot(t, [n, n], color=ONE["color"], linewidth=2)
                 ax.plot(bootstrap, [n - 0.27] * 2, color=TWO["color"], linewidth=2)
-                ax.plot(np.mean(values), n, "D", color="black", markersize=4.5)
+                ax.plot(np.mean(values), n, "|", color="black", markersize=9,
+                        markeredgewidth=1.6)
         ax.set_xscale("symlog", linthresh=1, linscale=0.8)
         ax.xaxis.set_minor_locator(plt.NullLocator())
-        labels = [f"{short(task)}, n = {len(found[0])}" for task, found
-                  in tasks.items()]
-        ax.set_yticks(range(len(labels)), labels, fontsize=8)
-        ax.set(title=pair, ylim=(len(labels) - 0.5, -0.5))
+        ax.set_yticks(range(len(tasks)), [
+            f"{short(task)}, n = " + "–".join(map(str, sorted(
+                {len(pairs[task][0]) for pairs in differences.values()})))
+            for task in tasks], fontsize=8)
+        ax.set(title=pair, ylim=(len(tasks) - 0.5, -0.5))
     furthest = max((np.abs(found[0]).max(initial=1) for tasks in differences.values()
                     for found in tasks.values()), default=1)
     ticks = [t for t in (1, 10, 100, 1000) if t <= 1.5 * furthest]

@@ -82,7 +82,8 @@ def plot_table_1(schedules, values, limit, axes=None, title=""):
     axes[1].annotate(f"limit {limit}".replace("-", "−"), (limit, 0.97), ha="right",
                      xycoords=("data", "axes fraction"), va="top", xytext=(-5, 0),
                      textcoords="offset points")
-    axes[1].set(xlabel="true value of a state", yticks=[], title="y may not go lower")
+    axes[1].set(xlabel="true value of a state", yticks=[],
+                title="true values, and a limit on y")
     for ax in axes:
         ax.title.set_size(9)
     return axes
@@ -161,7 +162,8 @@ def plot_consequences(found, expected=None, axes=None, title=""):
         for name, value in (expected or {}).get(quantity, {}).items():
             ax.plot(value, rows.index(name), "x", markersize=7, markeredgewidth=2,
                     color=TWO["color"])
-        reach = max([10.0, *(np.abs(v).max() for v, _ in readings.values() if len(v))])
+        reach = max([10.0, *(np.abs([*values, *(interval or ())]).max()
+                             for values, interval in readings.values() if len(values))])
         ax.set_xscale("symlog", linthresh=10, linscale=2)
         far = 100 if reach < 700 else 1000
         ax.set_xticks([-far, -10, -5, 0, 5, 10, far])
