@@ -92,6 +92,7 @@ def is_locked(cell):
 
 
 def is_check(cell):
+    """Is this a check, a locked cell that gives points?"""
     return is_locked(cell) and bool(cell.metadata.nbgrader.get("grade"))
 
 
