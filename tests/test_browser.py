@@ -156,7 +156,8 @@ def move_every_control(page, panel):
             else:
                 top = control.get_attribute("aria-valuemax")
                 at_top = control.get_attribute("aria-valuenow") == top
-                page.keyboard.press("ArrowLeft" if at_top else "ArrowRight")
+                for _ in range(10):  # one step may be too small for two decimals
+                    page.keyboard.press("ArrowLeft" if at_top else "ArrowRight")
             wait_until(lambda old=before: seen(panel)[0] != old[0]
                        and seen(panel)[1] != old[1], 20,
                        f"{kind} {i} of {before[0]} changed no text or no picture")
