@@ -52,8 +52,7 @@ def panel(title, sliders, draw, size=(6.4, 2.9), lines=1):
     """
     texts = [ipywidgets.Label() for _ in range(lines)]
     figure = Figure(figsize=size, dpi=90)  # without pyplot, which would keep it
-    natural = ipywidgets.Layout(width=f"{90 * size[0]:.0f}px", max_width="100%")
-    picture = ipywidgets.Image(format="png", layout=natural)  # else it is stretched
+    picture = image_of(figure)
     canvas = FigureCanvasAgg(figure)
 
     def update(_=None):
@@ -71,6 +70,13 @@ def panel(title, sliders, draw, size=(6.4, 2.9), lines=1):
     whole = Panel([*sliders.values(), *texts, picture])
     whole.title = title
     return whole
+
+
+def image_of(figure):
+    """An Image widget as wide as the figure; without a width the page stretches it."""
+    width = f"{figure.get_figwidth() * figure.dpi:.0f}px"
+    return ipywidgets.Image(format="png", layout=ipywidgets.Layout(
+        width=width, max_width="100%"))
 
 
 def slider(label, value, low, high, step):
@@ -471,8 +477,8 @@ class LiveTraining(Panel):
             button.on_click(lambda _, act=act: act())
         self.progress = ipywidgets.IntProgress(max=config.steps, description="steps")
         self.text = ipywidgets.Label("Press start.")
-        self.picture = ipywidgets.Image(format="png")
         self._figure = Figure(figsize=(7.4, 2.7), dpi=90)
+        self.picture = image_of(self._figure)
         self._canvas = FigureCanvasAgg(self._figure)
         super().__init__([ipywidgets.HBox(buttons), self.progress, self.text,
                           self.picture])

@@ -4,6 +4,7 @@ Skipped, with a reason, where Chromium or Playwright is missing. The screenshots
 build/screenshots: look at them after a change of a panel.
 """
 
+import json
 import os
 import re
 import secrets
@@ -35,9 +36,30 @@ FAULTS = ("[data-mime-type='application/vnd.jupyter.error'], "
 LONGEST = 240  # seconds for a chapter
 
 
+class Lab:
+    """A running JupyterLab."""
+
+    def __init__(self, url, token):
+        self.url, self.headers = url, {"Authorization": f"token {token}"}
+        self.token = token
+
+    def address(self, name):
+        return f"{self.url}/lab/tree/notebooks/{name}?token={self.token}&reset"
+
+    def ask(self, path, method="GET"):
+        request = urllib.request.Request(self.url + path, headers=self.headers,
+                                         method=method)
+        with urllib.request.urlopen(request) as answer:
+            return answer.read()
+
+    def stop_kernels(self):
+        for kernel in json.loads(self.ask("/api/kernels")):
+            self.ask(f"/api/kernels/{kernel['id']}", "DELETE")
+
+
 @pytest.fixture(scope="session")
 def lab(tmp_path_factory):
-    """A JupyterLab on loopback, with a copy of the book. Yields a function: its URLs.
+    """A JupyterLab on loopback, with a copy of the book. Yields where it is.
 
     A copy, since JupyterLab saves what it runs. The theme lies in its settings folder.
     """
@@ -70,7 +92,7 @@ def lab(tmp_path_factory):
             except (urllib.error.URLError, ConnectionError):
                 assert server.poll() is None, (home / "lab.log").read_text()
                 time.sleep(0.2)
-        yield lambda name: f"{url}/lab/tree/notebooks/{name}?token={token}&reset"
+        yield Lab(url, token)
     finally:
         server.terminate()  # it ends its kernels too
         server.wait(30)
@@ -85,10 +107,11 @@ def browser():
 
 
 @pytest.fixture
-def page(browser):
+def page(browser, lab):
     opened = browser.new_page(viewport={"width": 1300, "height": 1000})
     yield opened
     opened.close()
+    lab.stop_kernels()  # closing a page does not
 
 
 def wait_until(holds, seconds, what):
@@ -167,7 +190,7 @@ def move_every_control(page, panel):
 @pytest.mark.parametrize("path", CHAPTERS, ids=lambda path: path.stem)
 def test_a_chapter_runs_in_a_browser_and_its_panels_answer(path, lab, page):
     theme = "Dark" if path.stem[:2] in DARK else "Light"
-    open_and_run(page, lab(path.name), theme)
+    open_and_run(page, lab.address(path.name), theme)
     SCREENSHOTS.mkdir(parents=True, exist_ok=True)
     scroll_through(page)
     assert page.locator(FAULTS).count() == 0, page.locator(FAULTS).first.inner_text()
@@ -189,7 +212,7 @@ def test_the_live_training_panel_starts_pauses_goes_on_and_stops(lab, page):
                if "live_training(" in path.read_text(encoding="utf-8")]
     if not with_it:
         pytest.skip("no chapter shows the live training panel")
-    open_and_run(page, lab(with_it[0].name), "Light")
+    open_and_run(page, lab.address(with_it[0].name), "Light")
     scroll_through(page)
     panel = page.locator(".widget-vbox:has(button:has-text('start'))").last
 
