@@ -152,7 +152,7 @@ def scroll_through(page):
 
 
 def panels(page):
-    """The panels on the page: boxes that hold a picture or a progress bar."""
+    """The panels on the page: boxes that hold a picture."""
     return page.locator(".jp-OutputArea-output .widget-vbox:has(.widget-image)")
 
 
