@@ -22,6 +22,7 @@ import ipywidgets
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from dnddpg_minimal import arm, bias, plots
 from dnddpg_minimal.dnddpg import (
@@ -43,25 +44,42 @@ class Panel(ipywidgets.VBox):
         return f"Panel: {self.title}"
 
 
-def panel(title, sliders, draw, size=(6.4, 2.9), lines=1):
+def panel(title, sliders, draw, size=(6.4, 2.9), lines=1, still=()):
     """Sliders (a dict from a name to a widget) above a text and a picture.
 
     `draw(figure, **values)` fills an empty matplotlib Figure and returns the text, or
     with `lines` above 1 a tuple of so many lines. It is called now, and again whenever
     a slider moves.
+
+    Most of the time goes into axes, ticks and maps. Where `still` names the sliders
+    that change them, the figure is emptied only when one of those moves. Otherwise
+    `draw` finds its axes there, and only artists made with `animated=True` are drawn
+    anew, over a copy of the rest.
     """
     texts = [ipywidgets.Label() for _ in range(lines)]
     figure = Figure(figsize=size, dpi=90)  # without pyplot, which would keep it
     picture = image_of(figure)
     canvas = FigureCanvasAgg(figure)
+    drawn = {}  # the rest: the values of `still` it is drawn for, and its pixels
 
     def update(_=None):
-        figure.clear()
-        said = draw(figure, **{name: s.value for name, s in sliders.items()})
+        values = {name: s.value for name, s in sliders.items()}
+        kept = [values[name] for name in still]
+        fresh = not still or drawn.get("for") != kept
+        if fresh:
+            figure.clear()
+        said = draw(figure, **values)
         for text, line in zip(texts, (said,) if lines == 1 else said, strict=True):
             text.value = line
+        if fresh:
+            canvas.draw()
+            drawn.update({"for": kept, "pixels": canvas.copy_from_bbox(figure.bbox)})
+        canvas.restore_region(drawn["pixels"])
+        for artist in figure.findobj(lambda artist: artist.get_animated()):
+            figure.draw_artist(artist)
         file = io.BytesIO()
-        canvas.print_png(file, pil_kwargs={"compress_level": 1})  # quick, not small
+        Image.fromarray(np.asarray(canvas.buffer_rgba())).save(
+            file, "PNG", compress_level=1)  # quick, not small
         picture.value = file.getvalue()
 
     for slider in sliders.values():
@@ -231,21 +249,29 @@ def error_plane_explorer(folder=None):
         path, truth = follow(world, agent, state)
         obs = world.observe(state)
         q = agent.q_values(obs, agent.act(obs))[:, 0]  # (C,)
+        if not figure.axes:
+            prepare(figure, algorithm, plane, i)
+        here, way = (ax.lines[0] for ax in figure.axes[:2])
+        here.set_data([angle], [velocity])
+        way.set_data(range(len(path)), np.cos(path[:, 0]))
+        critics = ", ".join(f"Q{c + 1} {value:.1f}" for c, value in enumerate(q))
+        return (f"{algorithm}, seed {seed}, step {step:,}: {critics}; truth "
+                f"{truth:.1f}; min Q − truth {q.min() - truth:+.1f}.")
+
+    def prepare(figure, algorithm, plane, i):
+        """All but the chosen state and its rollout."""
         left, right = figure.subplots(1, 2, width_ratios=(1, 1.2), gridspec_kw=dict(
             left=0.08, right=0.98, bottom=0.2, top=0.88, wspace=0.42))
         error = plane["q"][i].min(axis=0) - plane["truth"][i]
         limit = max(np.quantile(np.abs(error), 0.95), 1.0)
         picture = dict(x=plane["x"], y=plane["y"])
         image = plots.draw_map(left, picture, error, plots.ERRORS, -limit, limit)
-        left.plot(angle, velocity, "o", color="black", markerfacecolor="white")
+        left.plot([], [], "o", color="black", markerfacecolor="white", animated=True)
         left.set(ylabel="velocity", title="min Q − truth")
         figure.colorbar(image, ax=left).set_label("← under   over →", fontsize=8)
-        right.plot(np.cos(path[:, 0]), **plots.STYLE[algorithm])
-        right.set(ylim=(-1.1, 1.1), xlabel="step of the rollout",
+        right.plot([], [], animated=True, **plots.STYLE[algorithm])
+        right.set(xlim=(0, SHOWN), ylim=(-1.1, 1.1), xlabel="step of the rollout",
                   title="height: 1 is upright, −1 hangs")
-        critics = ", ".join(f"Q{c + 1} {value:.1f}" for c, value in enumerate(q))
-        return (f"{algorithm}, seed {seed}, step {step:,}: {critics}; truth "
-                f"{truth:.1f}; min Q − truth {q.min() - truth:+.1f}.")
 
     def choice(kind, label, options, value):
         return kind(options=options, value=value, description=label,
@@ -261,14 +287,18 @@ def error_plane_explorer(folder=None):
         "angle": slider("angle (0 is upright), rad", 3.0, -3.1, 3.1, 0.1),
         "velocity": slider("velocity, rad/s", 0.0, -8.0, 8.0, 0.5),
     }
-    return panel("the error-plane explorer", controls, draw, size=(7.4, 2.7))
+    return panel("the error-plane explorer", controls, draw, size=(7.4, 2.7),
+                 still=("algorithm", "seed", "step"))
 
 
-def follow(world, agent, state, steps=500, shown=150):
-    """One rollout from state (1, S): its first `shown` states, and its truth."""
+SHOWN = 150  # steps of a rollout that are drawn
+
+
+def follow(world, agent, state, steps=500):
+    """One rollout from state (1, S): its first SHOWN states, and its truth."""
     path, truth = [], 0.0
     for t in range(steps):
-        if t < shown:
+        if t < SHOWN:
             path.append(state[0])
         state, reward, _ = world.step(state, agent.act(world.observe(state)))
         truth += agent.config.gamma**t * reward[0]

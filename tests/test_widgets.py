@@ -46,6 +46,13 @@ def test_every_control_of_the_explorer_changes_text_and_picture():
         assert control.description
     assert "DN-DDPG, seed 1, step 4,000" in text.value
 
+    # What was drawn over a kept picture is what a whole new picture would show.
+    afresh = widgets.error_plane_explorer()
+    for control, like in zip(reversed(afresh.children[:-2]), reversed(controls),
+                             strict=True):
+        control.value = like.value  # the state first, then what empties the figure
+    assert afresh.children[-1].value == picture.value
+
 
 def test_the_explorer_says_where_recordings_are_missing(tmp_path):
     with pytest.raises(FileNotFoundError, match="study"):
