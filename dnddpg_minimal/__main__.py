@@ -175,6 +175,7 @@ ELSEWHERE = {
     "study": "Run, resume and list the recorded study.",
     "benchmark": "Measure the speed, side by side with a peer.",
     "check": "Run an exercise notebook, and print its points.",
+    "book": "Run chapters and write what they show, or measure how long they take.",
 }
 
 

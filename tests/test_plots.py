@@ -1,9 +1,5 @@
 """Figures draw what they are given, and mean the same thing everywhere."""
 
-import base64
-import json
-import re
-from pathlib import Path
 
 import matplotlib
 
@@ -14,9 +10,6 @@ import numpy as np
 import pytest
 
 from dnddpg_minimal import ALGORITHMS, Record, plots
-from dnddpg_minimal.plots.__main__ import save_last_figure
-
-NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
 
 @pytest.fixture(autouse=True)
@@ -104,22 +97,3 @@ def test_a_figure_can_be_drawn_into_axes_of_ones_own(picture):
     assert plots.plot_error_plane(picture, axes=axes) is axes
     assert plots.plot_truth(picture, ax=axes[0]) is axes[0]
     assert plt.get_fignums() == [figure.number]
-
-
-@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("03*.ipynb")),
-                         ids=lambda path: path.stem)
-def test_the_picture_at_the_top_is_the_chapters_last_figure(path):
-    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-    (name,) = re.findall(r"!\[.+\]\((figures/\S+\.png)\)", "".join(cells[0]["source"]))
-    figures = [output["data"]["image/png"] for cell in cells
-               for output in cell.get("outputs", [])
-               if "image/png" in output.get("data", {})]
-    last = base64.b64decode("".join(figures[-1]))
-    assert (path.parent / name).read_bytes() == last
-
-
-def test_a_notebook_that_was_never_run_has_no_last_figure(tmp_path):
-    path = tmp_path / "x.ipynb"
-    path.write_text(json.dumps({"cells": [{"cell_type": "code", "outputs": []}]}))
-    with pytest.raises(ValueError, match="run it first"):
-        save_last_figure(path)

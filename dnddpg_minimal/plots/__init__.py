@@ -73,11 +73,6 @@ caller, who knows it, passes them.
 | `plot_questions(groups)` | one critic asked in three ways, and the truth |
 
 One module for each group of chapters; `style.py` holds what they share.
-
-    python -m dnddpg_minimal.plots notebooks/03_ddpg.ipynb
-
-writes a chapter's last figure to `notebooks/figures/03_ddpg.png`, which the chapter
-shows at its top.
 """
 
 from dnddpg_minimal.plots.arm import (

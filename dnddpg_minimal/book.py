@@ -1,0 +1,191 @@
+"""The chapters as files: run them, keep what they show, measure how long they take.
+
+    python -m dnddpg_minimal book notebooks/05_second_critic.ipynb    run, and write
+    python -m dnddpg_minimal book --measure                           only measure
+
+To run a chapter here does what "Run all cells" and "Save" do in JupyterLab, but the
+same run always writes the same file: no times, no state of widgets, a progress bar as
+it last looked, one output where a cell printed in pieces. Then the chapter's last
+figure goes to `notebooks/figures/`, if the top of the chapter shows it.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+import shlex
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from .benchmark import machine
+
+ROOT = Path(__file__).parent.parent
+CELL_LIMIT = 600  # seconds
+
+
+def run_chapter(path):
+    """Run a notebook in a kernel of its own → the notebook, with its outputs.
+
+    Nothing is written. Cells keep their times in `metadata.execution`. ValueError
+    where a cell fails: the chapter, and what the cell said.
+    """
+    import nbformat
+    from nbclient import NotebookClient
+    from nbclient.exceptions import CellExecutionError
+
+    notebook = nbformat.read(path, as_version=4)
+    place = {"metadata": {"path": str(Path(path).parent)}}
+    try:
+        NotebookClient(notebook, timeout=CELL_LIMIT, resources=place,
+                       coalesce_streams=True).execute()  # a bar as it last looked
+    except CellExecutionError as error:
+        raise ValueError(f"{path}: a cell fails with {error.ename}: {error.evalue}. "
+                         "The file is as it was.") from error
+    return notebook
+
+
+def tidy(notebook):
+    """Take out of a notebook, in place, all that differs from run to run."""
+    notebook.metadata.pop("widgets", None)
+    notebook.metadata["language_info"] = {"name": "python"}
+    for cell in notebook.cells:
+        cell.metadata.pop("execution", None)
+
+
+def write_chapter(notebook, path):
+    """Write a notebook as JupyterLab does: keys in order, one space, a last newline."""
+    import nbformat
+
+    part = Path(f"{path}.part")
+    nbformat.write(notebook, part)
+    part.replace(path)
+
+
+def pictures(notebook):
+    """The PNGs of a notebook's outputs, in order, as bytes."""
+    return [base64.b64decode("".join(output["data"]["image/png"]))
+            for cell in notebook["cells"] for output in cell.get("outputs", [])
+            if "image/png" in output.get("data", {})]
+
+
+def save_last_figure(path):
+    """Write the last figure of an executed notebook beside it, → the file's path.
+
+    It becomes `figures/NN_name.png` in the notebook's folder. ValueError if the
+    notebook shows no figure.
+    """
+    import nbformat
+
+    path = Path(path)
+    figures = pictures(nbformat.read(path, as_version=4))
+    if not figures:
+        raise ValueError(f"{path} holds no figure: run it first.")
+    figure = path.parent / "figures" / f"{path.stem}.png"
+    figure.parent.mkdir(exist_ok=True)
+    figure.write_bytes(figures[-1])
+    return figure
+
+
+# --- Measuring ------------------------------------------------------------------------
+
+
+def chapter_times(path):
+    """How long a chapter takes: seconds in all, to its first picture; kB. A dict.
+
+    Seconds count from the start of its kernel. "largest PNG" is of its outputs.
+    """
+    started = time.time()
+    notebook = run_chapter(path)
+    row = {"chapter": Path(path).stem, "seconds": time.time() - started}
+    shown = (cell for cell in notebook.cells if pictures({"cells": [cell]}))
+    first = next(shown, None)
+    if first is not None:
+        done = first.metadata.execution["shell.execute_reply"]
+        done = datetime.fromisoformat(done.replace("Z", "+00:00")).timestamp()
+        row["to first picture"] = done - started
+    row["kB"] = Path(path).stat().st_size / 1e3
+    row["largest PNG, kB"] = max(map(len, pictures(notebook)), default=0) / 1e3
+    return row
+
+
+def import_seconds(rounds=5):
+    """Median seconds to import this package, beyond Gymnasium's own, without torch."""
+    code = ("import sys, time, gymnasium; start = time.perf_counter();"
+            "import dnddpg_minimal; print(time.perf_counter() - start);"
+            "assert 'torch' not in sys.modules")
+    runs = [subprocess.run([sys.executable, "-c", code], check=True, text=True,
+                           capture_output=True, cwd=ROOT) for _ in range(rounds)]
+    return statistics.median(float(run.stdout) for run in runs)
+
+
+def readme_commands():
+    """README's second command in its parts: make the environment, install, test."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    command = re.search(r"^python3 -m venv .*pytest --nbval.*$", readme, re.M)[0]
+    return [part.strip() for part in command.split("&&")]
+
+
+def whole():
+    """Seconds of each part of README's second command, in a fresh clone: a dict."""
+    seconds = {}
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run(["git", "clone", "-q", str(ROOT), folder], check=True)
+        for part in readme_commands():
+            started = time.time()
+            subprocess.run(shlex.split(part), check=True, cwd=folder,
+                           stdout=sys.stderr)
+            seconds[part] = time.time() - started
+    return seconds
+
+
+# --- Command line ---------------------------------------------------------------------
+
+
+def main(argv=None) -> int:
+    """`python -m dnddpg_minimal book`: see --help. Returns the exit code."""
+
+
+    return tyro.cli(command, args=argv, prog="python -m dnddpg_minimal book")
+
+
+def command(chapters: Annotated[tuple[Path, ...], tyro.conf.Positional] = (),
+            measure: bool = False, readme: bool = False) -> int:
+    """Run chapters and write them; or, with --measure, only say how long they take.
+
+    Args:
+        chapters: notebooks; none: every one in `notebooks/`.
+        measure: write nothing, print a table: seconds, kB.
+        readme: with --measure: time README's second command too, in a fresh clone.
+    """
+    import pandas
+
+    chapters = chapters or sorted((ROOT / "notebooks").glob("*.ipynb"))
+    missing = [str(path) for path in chapters if not path.is_file()]
+    if missing:
+        raise FileNotFoundError(f"{missing[0]}: no such notebook.")
+    if not measure:
+        for path in chapters:
+            notebook = run_chapter(path)
+            tidy(notebook)
+            write_chapter(notebook, path)
+            top = notebook.cells[0].source
+            made = (save_last_figure(path) if f"figures/{path.stem}.png" in top else "")
+            print(path, made)
+        return 0
+    rows = pandas.DataFrame([chapter_times(path) for path in chapters])
+    print(machine())
+    print(rows.to_string(index=False, float_format="%.1f", na_rep="-"))
+    print(f"\nChapters: median {rows.seconds.median():.0f} s, longest "
+          f"{rows.seconds.max():.0f} s. Import: {import_seconds():.2f} s beyond "
+          "gymnasium's own.")
+    for part, seconds in whole().items() if readme else ():
+        print(f"{seconds / 60:.1f} min  {part}")
+    return 0
