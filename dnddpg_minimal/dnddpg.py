@@ -18,13 +18,16 @@ Networks of one kind stand side by side: every array of weights has a leading ax
     (4)  policy gradient                         Agent.update, NumpyAgent.climb_critics
     (5)-(10) overestimation                      measured, in bias.py
     (11) y = r + gamma min of two critics        td_target
-    (12) the better of two actions               choose_actor, td_target, Agent.act
+    (12) the better of two actions               choose_actor, Agent.act
 
 Where the paper is silent or contradicts itself, the choice is a field of `Config`,
 and the default is named there. The largest difference: Eq. (11) as printed uses one
 actor only, so that the second could change nothing in the target. Here the target is
 the max over actors of the min over critics (section 3.2 in words); the printed
 equation is `target_rule="single"`.
+
+To read the algorithm only, read sections 3 to 6. Section 1 holds its choices, with the
+checks of what a user gives; 2, 7 and 8 make a run of it.
 
 Axes: C critics, K actors, B batch, O observation, A action. Actions lie in [-1, 1]
 everywhere in this file; `to_env` alone turns them into the units of the task.

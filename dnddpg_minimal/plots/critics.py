@@ -7,6 +7,7 @@ from dnddpg_minimal.plots.style import (
     ERRORS,
     ONE,
     SIGN,
+    SIGN_TURNED,
     STYLE,
     THREE,
     TRUTH,
@@ -41,7 +42,7 @@ def plot_one_backup(x, forms, samples, measured=None, xlabel="", legend="best",
         if label in samples:
             ax.plot(*samples[label], "o", markersize=4.5, markerfacecolor="white",
                     markeredgecolor=style["color"])
-    ax.set(title=title, xlabel=xlabel, ylabel=f"bias of one target / σ\n{SIGN}")
+    ax.set(title=title, xlabel=xlabel, ylabel=f"bias of one target / σ\n{SIGN_TURNED}")
     ax.yaxis.label.set_size(8)
     ax.legend(loc=legend)
     return ax
@@ -62,7 +63,7 @@ def plot_over_training(table, columns, log=(), limits=None, axes=None, title="")
     for ax, (column, label) in zip(np.ravel(axes), columns.items()):
         if column == "bias":
             ax.axhline(0, **TRUTH)
-            label = f"{label}\n{SIGN}"
+            label = f"{label}\n{SIGN_TURNED}"
         for name, runs in table.groupby("algorithm", sort=False):
             seeds = runs.pivot(index="step", columns="seed", values=column).dropna()
             style = STYLE[name]
@@ -79,7 +80,7 @@ def plot_over_training(table, columns, log=(), limits=None, axes=None, title="")
         ax.xaxis.set_major_locator(plt.MaxNLocator(4))
         thousands(ax)
     if table.algorithm.nunique() > 1:
-        np.ravel(axes)[-1].legend(loc="best", fontsize=8)
+        np.ravel(axes)[-1].legend(loc="best", fontsize=8, handlelength=3)
     return axes
 
 
@@ -176,8 +177,12 @@ def plot_differences_by_seed(differences, predicted=None, axes=None, title=""):
             ax.plot(interval, [n, n], color="black", linewidth=1.5)
             ax.plot(np.mean(values), n, "D", color="black", markersize=6)
         for name, value in (predicted or {}).get(label, {}).items():
-            ax.plot(value, list(pairs).index(name) - 0.2, "x", markersize=7,
-                    markeredgewidth=2, color=THREE["color"])
+            cross, = ax.plot(value, list(pairs).index(name) - 0.2, "x", markersize=7,
+                             markeredgewidth=2, color=THREE["color"])
+            cross.set_label("predicted")
         ax.set_yticks(range(len(pairs)), list(pairs))
         ax.set(xlabel=label, ylim=(len(pairs) - 0.5, -0.5))
+        shown = dict(zip(*reversed(ax.get_legend_handles_labels())))  # each label once
+        if shown:
+            ax.legend(shown.values(), shown, loc="best", fontsize=8)
     return axes

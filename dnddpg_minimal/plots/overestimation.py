@@ -7,7 +7,7 @@ from dnddpg_minimal.plots.style import (
     ERRORS,
     GREY,
     ONE,
-    SIGN,
+    SIGN_TURNED,
     STYLE,
     THREE,
     TRUTH,
@@ -149,8 +149,8 @@ def plot_owed(table, owed, control, predicted, axes=None, title=""):
     table: bias of recorded runs, one row per evaluation, any algorithms; each seed of
     DDPG is a thin line. owed: (step (M,), bias (M,)) of DDPG. The scale is linear up to
     ±40 and logarithmic beyond. Right: control, a dict from a label to (updates (N,),
-    bias (S, N)) of S agents, one dot each; predicted: (updates (M,), bias (M,)) of the
-    frozen ones.
+    bias (S, N)) of S agents, dots on a thin line each; predicted: (updates (M,), bias
+    (M,)) of the frozen ones.
     """
     if axes is None:
         figure, axes = plt.subplots(1, 2, figsize=(7.2, 2.7), layout="constrained",
@@ -166,15 +166,15 @@ def plot_owed(table, owed, control, predicted, axes=None, title=""):
             label="owed by DDPG")
     ax.set_yscale("symlog", linthresh=40, linscale=2)
     ticks = [-40, -20, 0, 20, 40, 600]
-    ax.set_yticks(ticks, [f"{tick:+d}".replace("-", "−") for tick in ticks])
+    ax.set_yticks(ticks, ["−40", "−20", "0", "+20", "+40", "+600"])
     ax.set_yticks([], minor=True)
     ax.set(xlabel="environment steps", xticks=[0, 20_000, 40_000], ylim=(-45, 9_000))
-    ax.set_ylabel(f"Q − truth, start states\n{SIGN}", fontsize=8)
+    ax.set_ylabel(f"Q − truth, start states\n{SIGN_TURNED}", fontsize=8)
     ax.legend(loc="upper right", ncols=2)
 
     for (label, (updates, runs)), style in zip(control.items(), (ONE, TWO)):
-        right.plot(updates, np.transpose(runs), "o", markersize=4,
-                   markerfacecolor="white", markeredgecolor=style["color"])
+        right.plot(updates, np.transpose(runs), "o-", markersize=4, linewidth=0.5,
+                   color=style["color"], markerfacecolor="white")
         right.plot(updates, np.mean(runs, axis=0), label=label, **style)
     right.plot(*predicted, label="predicted", color="black", linestyle=":")
     right.set(xlabel="further updates", xticks=[0, 1_000, 2_000])

@@ -16,6 +16,7 @@ TRUTH = dict(color="black", linestyle="-", linewidth=1.2)
 WRONG = dict(color="#CC79A7", linestyle=":", linewidth=2.4)  # a fault, on purpose
 VALUES, ERRORS = "cividis", "RdBu_r"  # maps of values, and of errors around 0
 SIGN = "overestimates ↑ / underestimates ↓"
+SIGN_TURNED = "← underestimates / overestimates →"  # beside an upright axis
 GREY = "0.6"
 ONE = dict(color="#E69F00", linestyle="-", linewidth=2)  # lines of no algorithm
 TWO = dict(color="#56B4E9", linestyle="--", linewidth=2)

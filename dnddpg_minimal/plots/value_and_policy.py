@@ -230,7 +230,7 @@ def plot_price(slopes, bias, lost, axes=None, title=""):
                 ax.plot(slopes, values, marker, color=style["color"], label=label)
         ax.set_xlabel("slope m of the critic's error along the action")
         ax.legend()
-    axes[0].set(ylabel="Q − truth")
+    axes[0].set(ylabel="critic − best policy's Q")
     axes[0].margins(y=0.2)
     axes[1].set(ylabel="true value lost")
     return axes
