@@ -29,6 +29,7 @@ from .benchmark import machine
 
 ROOT = Path(__file__).parent.parent
 CELL_LIMIT = 600  # seconds
+WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
 def run_chapter(path):
@@ -58,6 +59,8 @@ def tidy(notebook):
     notebook.metadata["language_info"] = {"name": "python"}
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)
+        for output in cell.get("outputs", []):
+            output.get("data", {}).pop(WIDGET, None)  # a random name; the text stays
 
 
 def write_chapter(notebook, path):

@@ -29,6 +29,7 @@ import platform
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections import Counter, deque
@@ -389,13 +390,27 @@ def default_scratch():
     return Path(places.get(sys.platform, usual)) / "dnddpg_minimal"
 
 
+def writable(folder, option):
+    """Make a folder, and try it: hours of work shall not end without a record → Path.
+
+    OSError, with the option that names another folder, if nothing can be written.
+    """
+    folder = Path(folder).absolute()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError as error:
+        raise OSError(f"{folder}: nothing can be written there ({error.strerror}). "
+                      f"Name another folder: {option} FOLDER") from error
+
+
 class Checkpoint:
     """The files of one unfinished run: its Training, its Notes, its lock."""
 
     def __init__(self, run, folder, scratch=None):
         self.run = run
-        scratch = Path(scratch or default_scratch())
-        scratch.mkdir(parents=True, exist_ok=True)
+        scratch = writable(scratch or default_scratch(), "--scratch")
         key = f"{Path(folder).resolve()}|{run.name}|{run.bug}|{run.config.to_json()}"
         stem = hashlib.sha256(key.encode()).hexdigest()[:24]
         self.training, self.notes, self.lock, self.status = (
@@ -608,8 +623,9 @@ def study(runs, folder=RECORDINGS, scratch=None, workers=2, nice=10, scheduler=N
     names of the runs that ended just now and the `Checkpoint`s of those that go on. A
     run whose process dies is done again, at most three times.
     """
-    folder = Path(folder).resolve()
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = writable(folder, "--folder").resolve()
+    if scheduler is None:  # a cluster's machines have their own
+        writable(scratch or default_scratch(), "--scratch")
     waiting = deque(run for run in runs if not (folder / f"{run.name}.npz").exists())
     failed, deaths, futures = {}, Counter(), {}
     with one_thread():

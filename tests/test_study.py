@@ -408,6 +408,18 @@ def do_all(runs, folder, scratch):
     return done
 
 
+@pytest.mark.parametrize("option", ["folder", "scratch"])
+def test_a_folder_that_takes_no_files_is_refused_before_any_run(option, tmp_path):
+    (tmp_path / "file").touch()  # a folder cannot lie in a file, whoever asks
+    folders = {"folder": tmp_path / "records", "scratch": tmp_path / "scratch"}
+    folders[option] = tmp_path / "file" / "inside"
+    with pytest.raises(OSError, match=f"nothing can be written there .* --{option} "):
+        study.main(["--budget", "quick", "--task", "Pendulum-v1", "--workers", "1",
+                    *itertools.chain(*((f"--{name}", str(path))
+                                       for name, path in folders.items()))])
+    assert not list(tmp_path.rglob("*.npz"))
+
+
 def test_two_studies_on_one_folder_lose_and_double_nothing(tmp_path, runs, undisturbed):
     with ProcessPoolExecutor(2, mp_context=SPAWN) as pool:
         counts = [pool.submit(do_all, runs, tmp_path, tmp_path / "scratch")

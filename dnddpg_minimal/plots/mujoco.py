@@ -228,7 +228,7 @@ def plot_live(episodes, evaluations, q, truth, random, axes=None, title=""):
     """
     if axes is None:
         figure, axes = plt.subplots(1, 2, figsize=(7.4, 3), layout="constrained",
-                                    width_ratios=(5, 4))
+                                    width_ratios=(5, 4), dpi=80)
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     plot_learning(episodes, evaluations, random, ax=axes[0])
     axes[0].legend(loc="upper left", fontsize=8)
