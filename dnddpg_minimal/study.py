@@ -153,6 +153,9 @@ def _class():
             runs += _many(10, pendulum, dn, f"{field}={value}", **choice, **short)
     runs += _many(10, pendulum, ALGORITHMS, "slow=paper", **slow, **short)
     runs += _many(3, car, ALGORITHMS, "noise=gaussian", noise="gaussian", sigma=0.1)
+    # As large as the default's OU noise, but without its memory (chapter 08)
+    runs += _many(3, car, ddpg, "noise=gaussian,sigma=0.95", noise="gaussian",
+                  sigma=0.95)
     for ends in ("none", "any_end"):
         runs += _many(5, (*car, *hopper), ddpg, f"ends={ends}", ends=ends)
         runs += _many(5, arm, ddpg, f"success_terminates,ends={ends}", ends=ends,

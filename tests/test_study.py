@@ -107,6 +107,7 @@ def test_the_class_budget_is_the_issues_list():
                         ("Hopper-v5", 10), ("Walker2d-v5", 10), ("Humanoid-v5", 5)):
         assert count(f"{task}/class/") == 3 * seeds
     assert count("MountainCarContinuous-v0/noise=gaussian/") == 9
+    assert count("MountainCarContinuous-v0/noise=gaussian,sigma=0.95/DDPG-") == 3
     for variant in ("target_rule=single", "target_rule=paired_min", "y_min=-20",
                     "target_rule=selected", "target_rule=soft", "act_rule=max_min",
                     "act_rule=first", "climbs=first"):
