@@ -4,9 +4,9 @@
     python -m dnddpg_minimal book --measure                           only measure
 
 To run a chapter here does what "Run all cells" and "Save" do in JupyterLab, but the
-same run always writes the same file: no times, no state of widgets, a progress bar as
-it last looked, one output where a cell printed in pieces. Then the chapter's last
-figure goes to `notebooks/figures/`, if the top of the chapter shows it.
+same numbers always write the same file: no times, no state of widgets, a progress bar
+as it last looked (its speed differs), one output where a cell printed in pieces. Then
+the chapter's last figure goes to `notebooks/figures/`, if its top shows it.
 """
 
 from __future__ import annotations
@@ -100,8 +100,8 @@ def save_last_figure(path):
 # --- Measuring ------------------------------------------------------------------------
 
 
-def chapter_times(path):
-    """How long a chapter takes: seconds in all, to its first picture; kB. A dict.
+def measured(path):
+    """Run a chapter → (the notebook, a dict: seconds in all, to its first picture; kB).
 
     Seconds count from the start of its kernel. "largest PNG" is of its outputs.
     """
@@ -116,7 +116,7 @@ def chapter_times(path):
         row["to first picture"] = done - started
     row["kB"] = Path(path).stat().st_size / 1e3
     row["largest PNG, kB"] = max(map(len, pictures(notebook)), default=0) / 1e3
-    return row
+    return notebook, row
 
 
 def import_seconds(rounds=5):
@@ -161,12 +161,12 @@ def main(argv=None) -> int:
 
 def command(chapters: Annotated[tuple[Path, ...], tyro.conf.Positional] = (),
             measure: bool = False, readme: bool = False) -> int:
-    """Run chapters and write them; or, with --measure, only say how long they take.
+    """Run chapters, write them, and say how long they took.
 
     Args:
         chapters: notebooks; none: every one in `notebooks/`.
-        measure: write nothing, print a table: seconds, kB.
-        readme: with --measure: time README's second command too, in a fresh clone.
+        measure: write nothing.
+        readme: time README's second command too, in a fresh clone.
     """
     import pandas
 
@@ -174,16 +174,16 @@ def command(chapters: Annotated[tuple[Path, ...], tyro.conf.Positional] = (),
     missing = [str(path) for path in chapters if not path.is_file()]
     if missing:
         raise FileNotFoundError(f"{missing[0]}: no such notebook.")
-    if not measure:
-        for path in chapters:
-            notebook = run_chapter(path)
+    rows = []
+    for path in chapters:
+        notebook, row = measured(path)
+        rows.append(row)
+        if not measure:
             tidy(notebook)
             write_chapter(notebook, path)
-            top = notebook.cells[0].source
-            made = (save_last_figure(path) if f"figures/{path.stem}.png" in top else "")
-            print(path, made)
-        return 0
-    rows = pandas.DataFrame([chapter_times(path) for path in chapters])
+            if f"figures/{path.stem}.png" in notebook.cells[0].source:
+                save_last_figure(path)
+    rows = pandas.DataFrame(rows)
     print(machine())
     print(rows.to_string(index=False, float_format="%.1f", na_rep="-"))
     print(f"\nChapters: median {rows.seconds.median():.0f} s, longest "
