@@ -243,7 +243,7 @@ def in_words(name, text):
     """An error as one line: an AssertionError is a sentence by itself."""
     text = " ".join(text.split())
     if name == "NotImplementedError":
-        return "not done yet"
+        return "not done yet: a raise NotImplementedError is left"
     return f"{name}: {text}" if name not in ("", "AssertionError") else text
 
 

@@ -7,6 +7,8 @@ A check cell of an exercise calls
 | `claim(ok, sentence)` | `ok` is true | AssertionError with the sentence |
 | `close(value, expected, name)` | shape and numbers agree | ... with the numbers |
 
+`close` returns the value as an array: a student may well return a list.
+
 The one source of an exercise is `solutions/NN_name.ipynb`. From it
 
     python -m dnddpg_minimal.classroom generate      writes exercises/NN_name.ipynb
@@ -52,8 +54,9 @@ def claim(ok, sentence):
 def close(value, expected, name, atol=1e-6, rtol=0.0, mistakes=None):
     """AssertionError, in words and numbers, unless `value` is what was expected.
 
-    value: what the student's code returned; expected: an array or a number. `name`
-    stands at the beginning of the sentence. Shapes must be equal, nothing is broadcast.
+    value: what the student's code returned, which comes back as an array, also where it
+    is a list; expected: an array or a number. `name` stands at the beginning of the
+    sentence. Shapes must be equal, nothing is broadcast.
     mistakes: {sentence: what one gets by this mistake}; the sentence is added where
     the value is that of the mistake.
     """
@@ -70,7 +73,7 @@ def close(value, expected, name, atol=1e-6, rtol=0.0, mistakes=None):
         return value.shape == other.shape and np.allclose(value, other, rtol, atol)
 
     if same(expected):
-        return
+        return value
     for sentence, wrong in (mistakes or {}).items():
         if same(np.asarray(wrong, float)):
             raise AssertionError(f"{_difference(value, expected, name)} {sentence}")

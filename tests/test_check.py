@@ -50,7 +50,8 @@ def test_nothing_done_earns_nothing_and_exits_with_1(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].endswith(
         "checks of solutions/01_value.ipynb, hidden tests included")
-    assert lines[1:3] == ["Exercise 1.1: 0 of 2 points", "    not done yet"]
+    assert lines[1:3] == ["Exercise 1.1: 0 of 2 points",
+                          "    not done yet: a raise NotImplementedError is left"]
     assert lines[-1] == "Together: 0 of 14 points"
 
 
