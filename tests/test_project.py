@@ -60,7 +60,7 @@ def test_windows_has_the_same_two_commands():
     unix = [block for block in code_blocks("sh") if "-m venv" in block]
     translated = [command.replace("python3", "py -3").replace(" &&", ";")
                   .replace(".venv/bin/", ".venv\\Scripts\\") for command in unix]
-    assert code_blocks("powershell") == translated
+    assert "".join(code_blocks("powershell")) == "".join(translated)
 
 
 @pytest.mark.skipif(not shutil.which("bash") or os.name == "nt", reason="needs bash")
