@@ -109,6 +109,13 @@ def plot_parts(parts, ax=None, title=""):
     return ax
 
 
+def note_mean(ax, error):
+    """Write the mean of a map into its corner."""
+    ax.annotate(f"mean {error.mean():+.0f}".replace("-", "−"), (0.97, 0.04),
+                xycoords="axes fraction", ha="right", fontsize=8.5,
+                bbox=dict(facecolor="white", edgecolor="none", pad=1))
+
+
 def plot_mean_planes(planes, limit, axes=None, title=""):
     """Maps of the mean error: a row for each algorithm, a column for each time.
 
@@ -126,10 +133,7 @@ def plot_mean_planes(planes, limit, axes=None, title=""):
             # Few shades, a small file; none is white, so that the sign is always seen.
             shades = (np.floor(picture["error"] / limit * 5) + 0.5) / 5 * limit
             image = draw_map(ax, picture, shades, ERRORS, -limit, limit)
-            mean = picture["error"].mean()
-            ax.annotate(f"mean {mean:+.0f}".replace("-", "−"), (0.97, 0.04),
-                        xycoords="axes fraction", ha="right", fontsize=8.5,
-                        bbox=dict(facecolor="white", edgecolor="none", pad=1))
+            note_mean(ax, picture["error"])
             if np.allclose(picture["x"][-1], np.pi, atol=0.01):
                 angle_ticks(ax)
             if r == 0:

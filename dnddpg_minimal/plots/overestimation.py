@@ -3,6 +3,7 @@
 import matplotlib.pyplot as plt
 import numpy as np
 
+from dnddpg_minimal.plots.critics import note_mean
 from dnddpg_minimal.plots.style import (
     ERRORS,
     GREY,
@@ -122,13 +123,14 @@ def plot_error_and_share(pictures, limit, axes=None, title=""):
     """
     if axes is None:
         figure, axes = plt.subplots(2, len(pictures), figsize=(7, 3.2), sharex=True,
-                                    sharey=True, layout="constrained", dpi=75)
+                                    sharey=True, layout="constrained", dpi=70)
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for n, (step, picture) in enumerate(pictures.items()):
         error = picture["error"]
         mean = draw_map(axes[0, n], picture, error.mean(axis=0), ERRORS, -limit, limit)
         share = draw_map(axes[1, n], picture, 100 * (error > 0).mean(axis=0), "PuOr_r",
                      0, 100)
+        note_mean(axes[0, n], error)
         axes[0, n].set_title(f"step {step:,}".replace(",", " "), loc="center",
                              fontsize=9)
         axes[0, n].set_xlabel("")
@@ -154,7 +156,7 @@ def plot_owed(table, owed, control, predicted, axes=None, title=""):
     """
     if axes is None:
         figure, axes = plt.subplots(1, 2, figsize=(7.2, 2.7), layout="constrained",
-                                    width_ratios=(3, 2), dpi=75)  # a small file
+                                    width_ratios=(3, 2), dpi=70)  # a small file
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     ax, right = axes
     for name, runs in table.groupby("algorithm", sort=False):
