@@ -154,8 +154,6 @@ def whole():
 
 def main(argv=None) -> int:
     """`python -m dnddpg_minimal book`: see --help. Returns the exit code."""
-
-
     return tyro.cli(command, args=argv, prog="python -m dnddpg_minimal book")
 
 
@@ -181,6 +179,7 @@ def command(chapters: Annotated[tuple[Path, ...], tyro.conf.Positional] = (),
         if not measure:
             tidy(notebook)
             write_chapter(notebook, path)
+            row["kB"] = path.stat().st_size / 1e3
             if f"figures/{path.stem}.png" in notebook.cells[0].source:
                 save_last_figure(path)
     rows = pandas.DataFrame(rows)
