@@ -267,7 +267,7 @@ def four_panels(rows=1, height=2.6, title=""):
     """A figure with a column for each MuJoCo task: (figure, axes (rows, 4))."""
     # Few dots, and no smooth edges where lines are many: a small file
     figure, axes = plt.subplots(rows, 4, figsize=(7.6, height), sharex=True,
-                                squeeze=False, layout="constrained", dpi=78)
+                                squeeze=False, layout="constrained", dpi=72)
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     return figure, axes
 
