@@ -26,7 +26,7 @@ def plot_eight_tasks(curves, interval=None, seeds=False, limits=None, xlabel="",
     if axes is None:
         rows = -(-len(curves) // 4)
         figure, axes = plt.subplots(rows, min(4, len(curves)), squeeze=False,
-                                    figsize=(7, 1.55 * rows + 0.4), dpi=73,
+                                    figsize=(7, 1.55 * rows + 0.4), dpi=70,
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
         figure.supxlabel(xlabel, fontsize=9)
