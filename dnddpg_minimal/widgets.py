@@ -567,7 +567,7 @@ class LiveTraining(Panel):
         right.axhline(0, color="black", linewidth=1)
         right.plot(step, [row["bias"] for row in rows], marker="o", **style)
         right.set(title="min Q − truth", xlabel="environment steps")
-        right.set_ylabel(plots.SIGN, fontsize=7)
+        right.set_ylabel(plots.SIGN_TURNED, fontsize=7)
         right.set_yscale("symlog", linthresh=30)
         self._figure.tight_layout()
         file = io.BytesIO()

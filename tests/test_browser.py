@@ -204,6 +204,9 @@ def test_a_chapter_runs_in_a_browser_and_its_panels_answer(path, lab, page):
         assert move_every_control(page, found.nth(i)) > 0
         found.nth(i).scroll_into_view_if_needed()
         page.screenshot(path=SCREENSHOTS / f"{path.stem}-panel-{i}-{theme}.png")
+    page.evaluate("document.querySelectorAll('.jp-WindowedPanel-outer')"
+                  ".forEach(notebook => { notebook.scrollTop = 0 })")
+    page.wait_for_timeout(1_000)  # milliseconds, until the pictures are drawn
     page.screenshot(path=SCREENSHOTS / f"{path.stem}-{theme}.png")
 
 

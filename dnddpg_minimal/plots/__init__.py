@@ -158,6 +158,7 @@ from dnddpg_minimal.plots.style import (
     GREY,
     ONE,
     SIGN,
+    SIGN_TURNED,
     STYLE,
     THREE,
     TRUTH,
@@ -190,8 +191,9 @@ from dnddpg_minimal.plots.value_and_policy import (
 )
 
 __all__ = [
-    "ERRORS", "FATES", "GREY", "ONE", "SIGN", "STYLE", "THREE", "TRUTH", "TWO",
-    "VALUES", "WRONG", "angle_ticks", "draw_arm", "draw_lines", "draw_map", "draw_room",
+    "ERRORS", "FATES", "GREY", "ONE", "SIGN", "SIGN_TURNED", "STYLE", "THREE", "TRUTH",
+    "TWO", "VALUES", "WRONG", "angle_ticks", "draw_arm", "draw_lines", "draw_map",
+    "draw_room",
     "is_angle", "legend_below", "note_level", "pale", "photograph", "plot_ablations",
     "plot_actor", "plot_along_action", "plot_arm", "plot_bias", "plot_bias_and_return",
     "plot_body", "plot_climbing", "plot_consequences", "plot_coverage", "plot_decay",
