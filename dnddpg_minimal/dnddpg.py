@@ -187,8 +187,8 @@ class Config:
             actors = self.actors or min(2, critics)
         elif spelled:
             critics, actors = int(spelled[1]), int(spelled[2])
-        elif self.algorithm in ALGORITHMS:
-            critics, actors = ALGORITHMS[self.algorithm]
+        elif str(self.algorithm) in ALGORITHMS:
+            critics, actors = ALGORITHMS[str(self.algorithm)]
         else:
             raise ValueError(_not_allowed("algorithm", self.algorithm, ALGORITHMS))
         if self.critics not in (None, critics) or self.actors not in (None, actors):

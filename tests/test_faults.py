@@ -40,6 +40,7 @@ JUNK = st.one_of(
 @given(st.dictionaries(st.sampled_from([f.name for f in fields(Config)]), JUNK,
                        min_size=1, max_size=3))
 @example({"algorithm": "C0-K0"})
+@example({"algorithm": {}})
 @example({"critics": 0})
 def test_a_config_is_right_or_refused_in_a_sentence(values):
     try:
