@@ -236,11 +236,19 @@ def error_plane_explorer(folder=None):
     seeds = sorted({seed for _, seed in weights})
     times = [int(step) for step in next(iter(weights.values()))["step"]]
     world = bias.dynamics(Config("Pendulum-v1"))
+    one_plane = next(iter(planes.values()))  # all have the same axes
     agents = {}  # made when first looked at
 
     def draw(figure, algorithm, seed, step, angle, velocity):
         run, i = (algorithm, seed), times.index(step)
-        if run not in weights or run not in planes:
+        if not figure.axes:
+            prepare(figure, algorithm)
+        image, here, way = moved = (*figure.axes[0].images, *figure.axes[0].lines,
+                                    *figure.axes[1].lines)
+        recorded = run in weights and run in planes
+        for artist in moved:
+            artist.set_visible(recorded)
+        if not recorded:
             return f"{algorithm}, seed {seed}: not recorded."
         if (run, i) not in agents:
             agents[run, i] = load_agent_at(weights[run], i)
@@ -249,26 +257,24 @@ def error_plane_explorer(folder=None):
         path, truth = follow(world, agent, state)
         obs = world.observe(state)
         q = agent.q_values(obs, agent.act(obs))[:, 0]  # (C,)
-        if not figure.axes:
-            prepare(figure, algorithm, plane, i)
-        here, way = (ax.lines[0] for ax in figure.axes[:2])
+        image.set_data(plane["q"][i].min(axis=0) - plane["truth"][i])
         here.set_data([angle], [velocity])
         way.set_data(range(len(path)), np.cos(path[:, 0]))
         critics = ", ".join(f"Q{c + 1} {value:.1f}" for c, value in enumerate(q))
         return (f"{algorithm}, seed {seed}, step {step:,}: {critics}; truth "
                 f"{truth:.1f}; min Q − truth {q.min() - truth:+.1f}.")
 
-    def prepare(figure, algorithm, plane, i):
-        """All but the chosen state and its rollout."""
+    def prepare(figure, algorithm):
+        """All but the map, the chosen state and its rollout."""
         left, right = figure.subplots(1, 2, width_ratios=(1, 1.2), gridspec_kw=dict(
             left=0.08, right=0.98, bottom=0.2, top=0.88, wspace=0.42))
-        error = plane["q"][i].min(axis=0) - plane["truth"][i]
-        limit = max(np.quantile(np.abs(error), 0.95), 1.0)
-        picture = dict(x=plane["x"], y=plane["y"])
-        image = plots.draw_map(left, picture, error, plots.ERRORS, -limit, limit)
+        image = plots.draw_map(left, one_plane, np.zeros_like(one_plane["truth"][0]),
+                               plots.ERRORS, -LIMIT, LIMIT)
+        image.set_animated(True)
         left.plot([], [], "o", color="black", markerfacecolor="white", animated=True)
-        left.set(ylabel="velocity", title="min Q − truth")
-        figure.colorbar(image, ax=left).set_label("← under   over →", fontsize=8)
+        left.set(ylabel="velocity", title=f"min Q − truth, colours to ±{LIMIT}")
+        bar = figure.colorbar(image, ax=left, extend="both")
+        bar.set_label("← under   over →", fontsize=8)
         right.plot([], [], animated=True, **plots.STYLE[algorithm])
         right.set(xlim=(0, SHOWN), ylim=(-1.1, 1.1), xlabel="step of the rollout",
                   title="height: 1 is upright, −1 hangs")
@@ -288,10 +294,11 @@ def error_plane_explorer(folder=None):
         "velocity": slider("velocity, rad/s", 0.0, -8.0, 8.0, 0.5),
     }
     return panel("the error-plane explorer", controls, draw, size=(7.4, 2.7),
-                 still=("algorithm", "seed", "step"))
+                 still=("algorithm",))
 
 
 SHOWN = 150  # steps of a rollout that are drawn
+LIMIT = 80  # where the explorer's colours end: the same for all, to compare
 
 
 def follow(world, agent, state, steps=500):
