@@ -696,8 +696,10 @@ class NumpyAgent(Agent):
         self.scratch = defaultdict(dict)  # for each use, memory that is used again
 
     def _out(self, layers, x, use):
-        again = x.shape[-2] in (1, self.config.batch_size)  # the sizes of every step
-        return forward(layers, x, self.scratch[use] if again else None)[-1]
+        scratch = self.scratch[use]
+        if len(scratch) > 16:  # too many sizes of B: forget them
+            scratch.clear()
+        return forward(layers, x, scratch)[-1]
 
     def fit_critics(self, batch, y):
         """Critics: down the mean squared error against y (B,), Eq. (3) → losses (C,).
