@@ -17,6 +17,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,6 +31,7 @@ from dnddpg_minimal.films import (
     check_display,
     make_camera_env,
     play,
+    window_closed,
     write_film,
 )
 
@@ -146,27 +148,38 @@ def watch(
         seed: of the first episode's start; the next episode has the next number.
     """
     agent = NumpyAgent.load(file)  # also opens a PyTorch agent, and needs no PyTorch
+    starts = range(seed, seed + episodes)
     if film is None:
         check_display()
-        env = make_env(agent.config, render_mode="human")
-    else:
-        check_can_write(film, suffix=".gif")
-        env = make_camera_env(agent.config)
-    starts, steps = range(seed, seed + episodes), 0
-    for start in starts:
-        rewards = list(play(agent, env, start))
-        steps += len(rewards)
-        print(f"Seed {start}: return {sum(rewards):.1f} in {len(rewards)} steps")
-    if film is not None:
+        with closing(make_env(agent.config, render_mode="human")) as env:
+            for start in starts:
+                show(agent, env, start)
+        return 0
+    check_can_write(film, suffix=".gif")
+    with closing(make_camera_env(agent.config)) as env:
+        steps = sum(show(agent, env, start) for start in starts)
         every = math.ceil(steps / FILM_LENGTH)  # a picture every so many steps
         pictures = [env.render() for start in starts
                     for step, _ in enumerate(play(agent, env, start))
                     if step % every == 0]
         seconds = every / env.metadata.get("render_fps", 30)
-        write_film(film, pictures, seconds)
-        print(f"The film: {film}")
-    env.close()
+    write_film(film, pictures, seconds)
+    print(f"The film: {film}")
     return 0
+
+
+def show(agent, env, start):
+    """Play one episode and print its return → its number of steps.
+
+    A window that its user closes ends the command, as Ctrl-C does.
+    """
+    rewards = []
+    for reward in play(agent, env, start):
+        rewards.append(reward)
+        if env.render_mode == "human" and window_closed(env):
+            raise KeyboardInterrupt
+    print(f"Seed {start}: return {sum(rewards):.1f} in {len(rewards)} steps")
+    return len(rewards)
 
 
 # --- the commands ---------------------------------------------------------------------

@@ -107,6 +107,18 @@ def check_display():
                          "write a film instead, with --film FILE.gif")
 
 
+def window_closed(env):
+    """Has the user closed the window that `env` draws in? (Gymnasium does not look.)"""
+    if hasattr(env.unwrapped, "mujoco_renderer"):
+        import glfw
+
+        viewer = env.unwrapped.mujoco_renderer.viewer
+        return bool(glfw.window_should_close(viewer.window))
+    import pygame
+
+    return pygame.display.get_init() and pygame.event.peek(pygame.QUIT)
+
+
 def film(task, algorithm="DN-DDPG", variant="class", seed=0, folder=None):
     """Film a recorded agent from the start with seed 0, without noise.
 

@@ -260,6 +260,26 @@ def test_without_a_display_watch_asks_for_a_film(trained, capsys, monkeypatch):
     assert "--film" in fails_in_one_line(capsys, "watch", trained[0])
 
 
+def test_closing_the_window_ends_watch(trained, capsys, monkeypatch):
+    monkeypatch.setenv("DISPLAY", "none: SDL draws into memory")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    import pygame
+
+    flip, pictures = pygame.display.flip, []
+
+    def close_after_the_third():
+        flip()
+        pictures.append(1)
+        if len(pictures) == 3:
+            pygame.event.post(pygame.event.Event(pygame.QUIT))
+
+    monkeypatch.setattr(pygame.display, "flip", close_after_the_third)
+    assert main(["watch", str(trained[0])]) == 130
+    assert len(pictures) == 3
+    assert not pygame.display.get_init()  # the window is gone
+    assert capsys.readouterr().out == ""
+
+
 def test_the_command_to_go_on_survives_a_strange_file_name():
     if os.name != "nt":
         line = command("train --resume", "my run's file.npz")
