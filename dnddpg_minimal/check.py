@@ -158,11 +158,13 @@ def run(cells, folder, seconds, total):
     """Run code cells in a fresh kernel → {index: (kind of error, its text)}.
 
     A cell that takes too long, or ends the kernel, is left out and the rest is run
-    again without it, as long as there is time.
+    again without it, as long as there is time. What a cell did before is known, and
+    counts where there is no time to run it again.
     """
     from nbclient.exceptions import CellTimeoutError, DeadKernelError
 
     end, left_out = time.monotonic() + total, {}
+    known = {}  # index: its error when it ran last, None for none
     while True:
         errors = dict(left_out)
         client = fresh_client(cells, folder)
@@ -172,7 +174,8 @@ def run(cells, folder, seconds, total):
                     continue
                 left = int(end - time.monotonic())  # nbclient wants whole seconds
                 if left < 1:
-                    errors[index] = "", NOT_RUN
+                    if error := known.get(index, ("", NOT_RUN)):
+                        errors[index] = error
                     continue
                 client.timeout = min(seconds, left)
                 try:
@@ -183,9 +186,10 @@ def run(cells, folder, seconds, total):
                 except DeadKernelError:
                     left_out[index] = "", "ended the kernel"
                     break
+                known[index] = None
                 for output in cell.outputs:
                     if output.output_type == "error":
-                        errors[index] = output.ename, output.evalue
+                        known[index] = errors[index] = output.ename, output.evalue
             else:
                 return errors
 

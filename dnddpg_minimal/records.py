@@ -64,8 +64,6 @@ def load_study(task=None, algorithm=None, variant="class", what="evaluations",
     found = []
     pattern = f"{task or '*'}/{variant or '*'}/{algorithm or '*'}-*.npz"
     for path in Path(folder or RECORDINGS).glob(pattern):
-        if path.name.startswith("."):  # half written
-            continue
         try:
             found += _read(path, what, rule)
         except Exception as error:  # zipfile and NumPy raise a dozen kinds
@@ -203,7 +201,8 @@ def claims(runs):
     from dnddpg_minimal.statistics import verdict
 
     def of(name, algorithm):
-        return runs[name].xs(algorithm, level="algorithm").droplevel("variant")
+        chosen = runs.index.get_level_values("algorithm") == algorithm  # may be none
+        return runs[name][chosen].droplevel(["algorithm", "variant"])
 
     dn, dcn, ddpg = "DN-DDPG", "DCN-DDPG", "DDPG"
     said = {"return: DN > DDPG": of("return", dn) - of("return", ddpg),
@@ -221,9 +220,20 @@ def claims(runs):
 
 
 def write_readme(folder=None):
-    """Put the tables as measured into recordings/README.md, between its two marks."""
+    """Put the tables as measured into recordings/README.md, between its two marks.
+
+    ValueError if the folder has no record, or its README.md not both marks in order.
+    """
     path = Path(folder or RECORDINGS) / "README.md"
     begin, end = "<!-- measured -->\n", "<!-- end -->"
+    before, begun, rest = path.read_text(encoding="utf-8").partition(begin)
+    _, ended, after = rest.partition(end)
+    if not (begun and ended):
+        raise ValueError(f"{path}: the tables go between the lines {begin.strip()} and "
+                         f"{end}, in this order. It lacks one of them.")
+    if load_study(variant=None, folder=folder).empty:
+        raise ValueError(f"{path.parent} holds no record yet: there is nothing to put "
+                         "into the tables.")
     runs, table = results(None, folder)
     text = [f"{len(runs)} runs. Each number: mean ± standard error (number of runs).\n"]
     row = "| {} |".format
@@ -238,7 +248,7 @@ def write_readme(folder=None):
     for one in claims(runs.xs("class", level="variant", drop_level=False)):
         text.append("| {claim} | {task} | {mean:.3g} ± {error:.2g} ({n}) | {verdict} |"
                     .format(**one))
-    before, _, after = path.read_text(encoding="utf-8").partition(begin)
-    after = after.partition(end)[2]
-    path.write_text(before + begin + "\n".join(text) + "\n" + end + after,
+    part = Path(f"{path}.part")
+    part.write_text(before + begin + "\n".join(text) + "\n" + end + after,
                     encoding="utf-8", newline="\n")
+    part.replace(path)

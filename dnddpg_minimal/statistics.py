@@ -60,9 +60,14 @@ def scores(table, kind="end", column="mean"):
                    compare the width of two algorithms' bands (Brown and Forsythe,
                    1974, for a curve)
 
-    ValueError for another kind.
+    ValueError for another kind, and for a table that holds one run's seed in several
+    variants: a mean over them would be of nothing.
     """
     runs = ["task", "algorithm", "seed"]
+    if (table.groupby(runs).variant.nunique() > 1).any():
+        variants = ", ".join(table.variant.unique())
+        raise ValueError(f"scores() of the variants {variants}: they would be mixed. "
+                         "Choose one of them.")
     in_order = table.set_index(runs).index.unique()
     groups = table.sort_values("step", kind="stable").groupby(runs)[column]
     if kind == "end":

@@ -20,6 +20,7 @@ can be imported from here too. `python -m dnddpg_minimal study --help` is the co
 recordings/README.md says how to use it on one machine and on several.
 """
 
+import errno
 import gc
 import hashlib
 import itertools
@@ -191,18 +192,23 @@ def record(run, folder, scratch=None, stop=None, every=CHECKPOINT_EVERY, write=T
     episode's end after `every` seconds. Returns (what, arrays); `what` is
 
         "done"     `arrays` are the record's, or None if it was there already;
-                   with `write=False` the caller writes them
+                   with `write=False` the caller writes them, and a copy stays in
+                   `scratch`, so that a caller who lost them gets them again
         "stopped"  `stop`, an Event, was set; the checkpoint is written
         "busy"     another process is doing this run
     """
     path = Path(folder) / f"{run.name}.npz"
+    writable(scratch or default_scratch(), "--scratch")
     checkpoint = Checkpoint(run, folder, scratch)
     with only_one(checkpoint.lock) as free:
         if not free:
             time.sleep(1)
             return "busy", None
         if path.exists():
+            checkpoint.remove()  # a process may have been killed just before it did
             return "done", None
+        if checkpoint.record.exists():
+            return "done", read_npz(checkpoint.record)
         checkpoint.sweep(path)
         training, notes = checkpoint.load()
         last = saved = shown = time.monotonic()
@@ -221,8 +227,7 @@ def record(run, folder, scratch=None, stop=None, every=CHECKPOINT_EVERY, write=T
                 saved = time.monotonic()
         training.env.close()
         arrays = finish(run, training, notes)
-        if write:
-            write_record(path, arrays)
+        write_record(path if write else checkpoint.record, arrays)
         checkpoint.remove()
         return "done", arrays
 
@@ -265,10 +270,16 @@ def measure(run, training, item, notes):
     config, step = run.config, training.step
     if step == PROBE_STEP and notes.probe is None:
         notes.probe = fingerprint(training)
-    if item.kind != "grid":
+    by_episodes = config.episodes is not None
+    at_the_end = by_episodes and item.kind == "episode" and training.finished
+    if not (item.kind == "grid" or at_the_end):
         return
+    if at_the_end:  # this step may have been one of the grid
+        for name in ("evaluations", "bias"):
+            rows = [row for row in getattr(notes, name) if row["step"] != step]
+            setattr(notes, name, rows)
     full = None
-    if config.episodes is not None:  # then bias.evaluate can't know the quarters
+    if by_episodes and config.task in MUJOCO_TASKS:  # evaluate can't know the quarters
         quarter = 4 * training.episode // config.episodes
         full = quarter > (notes.evaluations[-1]["quarter"] if notes.evaluations else 0)
     found = bias.evaluate(training, full)
@@ -276,7 +287,7 @@ def measure(run, training, item, notes):
     row |= {name: value for name, value in found.operator.items() if name != "n"}
     for name, losses in (("critic", item.critic_loss), ("actor", item.actor_loss)):
         row |= {f"{name}_loss_{i}": loss for i, loss in enumerate(losses)}
-    if config.episodes is not None:
+    if full is not None:
         row["quarter"] = quarter
     notes.evaluations.append(_plain(row))
     notes.bias += [_plain(row) for row in found.bias]
@@ -413,12 +424,12 @@ class Checkpoint:
 
     def __init__(self, run, folder, scratch=None):
         self.run = run
-        scratch = writable(scratch or default_scratch(), "--scratch")
+        scratch = Path(scratch or default_scratch()).absolute()
         key = f"{Path(folder).resolve()}|{run.name}|{run.bug}|{run.config.to_json()}"
         stem = hashlib.sha256(key.encode()).hexdigest()[:24]
-        self.training, self.notes, self.lock, self.status = (
+        self.training, self.notes, self.record, self.lock, self.status = (
             scratch / f"{stem}.{end}" for end in
-            ("training.npz", "notes.npz", "lock", "status"))
+            ("training.npz", "notes.npz", "record.npz", "lock", "status"))
 
     def save(self, training, notes):
         """Write both, so that a run killed at any moment goes on from here."""
@@ -454,13 +465,16 @@ class Checkpoint:
     def sweep(self, path):
         """Remove what processes that were killed left half written."""
         for whole in (self.training, self.notes, path):
-            for part in whole.parent.glob(f".{whole.name}.*.part"):
+            for part in whole.parent.glob(f"{whole.name}.*.part"):  # see write_npz
                 part.unlink(missing_ok=True)
 
     def remove(self):
         """Delete the files of a run that is recorded."""
         for path in (self.training, self.notes, self.status):
             path.unlink(missing_ok=True)
+
+
+HELD = errno.EACCES, errno.EAGAIN, errno.EDEADLK  # "another process has the lock"
 
 
 @contextmanager
@@ -477,7 +491,9 @@ def only_one(path):
                 import fcntl
 
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except OSError as error:
+            if error.errno not in HELD:  # a file system that knows no locks
+                raise
             yield False
         else:
             yield True
@@ -614,7 +630,10 @@ def _start_worker(stop, nice):
 def _work(run, folder, scratch, every):
     gc.collect()  # the last run's replay memory may be 290 MB
     common = Path(folder).is_dir()  # False on a cluster without a common folder
-    return record(run, folder, scratch, _stop, every, write=common)
+    what, arrays = record(run, folder, scratch, _stop, every, write=common)
+    if what == "done" and arrays is None:  # it may lie on this machine only
+        arrays = read_npz(Path(folder) / f"{run.name}.npz")
+    return what, arrays
 
 
 def study(runs, folder=RECORDINGS, scratch=None, workers=2, nice=10, scheduler=None,
@@ -626,6 +645,8 @@ def study(runs, folder=RECORDINGS, scratch=None, workers=2, nice=10, scheduler=N
     names of the runs that ended just now and the `Checkpoint`s of those that go on. A
     run whose process dies is done again, at most three times.
     """
+    if workers < 1:
+        raise ValueError(f"workers={workers}: expected 1 or more.")
     folder = writable(folder, "--folder").resolve()
     if scheduler is None:  # a cluster's machines have their own
         writable(scratch or default_scratch(), "--scratch")
@@ -740,8 +761,6 @@ def command(
         readme: only write the tables as measured into the folder's README.md.
         films: only film the recorded agents that the book shows.
     """
-    if workers < 1:
-        raise ValueError(f"workers={workers}: expected 1 or more.")
     if readme:
         write_readme(folder)
         return 0
@@ -875,7 +894,5 @@ def probe(task, algorithm, hidden, batch_size, updates_per_step):
         acting = walking + 5e-5  # and the policy's own time
         return learning, 5 * 1_000 * acting, 4 * 64 * 2 * 500 * acting
     begun = time.process_time()
-    bias.evaluate(training, full=False)
-    between = time.process_time()
-    bias.evaluate(training, full=True)
-    return learning, between - begun, 10 * (time.process_time() - between)
+    bias.evaluate(training)
+    return learning, time.process_time() - begun, 0.0  # here each one is full

@@ -190,6 +190,13 @@ def maximisation_laboratory(sliders=("actors", "sigma", "rho"), rule="max_min",
             raise ValueError(f"{name!r} is no quantity of the laboratory: expected one "
                              f"of {', '.join(usual)}.")
     usual |= values
+    if rule in ("selected", "paired_min"):  # they need a critic for each actor
+        critics, actors = (LABORATORY[name][1:3] if name in sliders else
+                           (usual[name], usual[name]) for name in ("critics", "actors"))
+        if actors[1] > critics[0] or (rule == "paired_min" and critics[1] > actors[0]):
+            raise ValueError(f"rule={rule!r} needs a critic for each actor: expected "
+                             "critics and actors that stand still, such as critics=2, "
+                             "actors=2 without sliders for them.")
     for name, value in usual.items():
         low, high = LABORATORY[name][1:3]
         if not low <= value <= high:
@@ -505,7 +512,10 @@ class LiveTraining(Panel):
     def __init__(self, config):
         self.config, self.training, self._thread = config, None, None
         self.title = f"live training of {config.algorithm} on {config.task}"
-        self._go, self._stop = threading.Event(), threading.Event()
+        if config.steps is None:
+            raise ValueError(f"episodes={config.episodes}: the panel counts steps; "
+                             "give steps instead.")
+        self._go, self._stop = threading.Event(), None  # each run has its own stop
         buttons = [ipywidgets.Button(description=name, tooltip=f"{name} the training")
                    for name in ("start", "pause", "stop")]
         self.start_button, self.pause_button, self.stop_button = buttons
@@ -524,9 +534,11 @@ class LiveTraining(Panel):
         """Begin a run, or go on after a pause."""
         self._go.set()
         self.pause_button.description = "pause"
-        if self._thread is None or not self._thread.is_alive():
-            self._stop.clear()
-            self._thread = threading.Thread(target=self._work, daemon=True)
+        runs = self._thread is not None and self._thread.is_alive()
+        if not runs or self._stop.is_set():  # a stopped run ends by itself
+            self._stop, before = threading.Event(), self._thread if runs else None
+            self._thread = threading.Thread(target=self._work, daemon=True,
+                                            args=(self._stop, before))
             self._thread.start()
 
     def pause(self):
@@ -539,10 +551,14 @@ class LiveTraining(Panel):
 
     def stop(self):
         """End the run after the next record."""
-        self._stop.set()
+        if self._stop is not None:
+            self._stop.set()
         self._go.set()
+        self.pause_button.description = "pause"
 
-    def _work(self):
+    def _work(self, stop, before):
+        if before is not None:
+            before.join()
         try:
             self.training, found = Training(self.config), []
             for record in self.training:
@@ -555,7 +571,7 @@ class LiveTraining(Panel):
                     self._draw(found)
                 while not self._go.wait(0.1):
                     pass
-                if self._stop.is_set():
+                if stop.is_set():
                     break
             self.text.value = f"Over at step {self.training.step:,}. " + self.text.value
         except Exception as error:  # a thread's error would be seen by nobody

@@ -1,10 +1,13 @@
 """`python -m dnddpg_minimal check`: points, sentences, and what does not fool it."""
 
+import contextlib
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from nbclient.exceptions import CellTimeoutError
 
 from dnddpg_minimal import check
 from dnddpg_minimal.__main__ import main
@@ -90,6 +93,25 @@ def test_the_whole_notebook_has_a_time_limit(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "was not run: the time for the whole notebook was over" in out
     assert out.endswith("Together: 0 of 14 points\n")
+
+
+def test_a_cell_that_hangs_takes_no_points_away_from_the_cells_before(monkeypatch):
+    clock = [0.0]
+
+    class Client:  # a cell is the number of seconds that it takes
+        def setup_kernel(self, **_):
+            return contextlib.nullcontext()
+
+        def execute_cell(self, cell, index):
+            clock[0] += min(cell.seconds, self.timeout)
+            if cell.seconds > self.timeout:
+                raise CellTimeoutError
+
+    monkeypatch.setattr(check, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr(check, "fresh_client", lambda *_: Client())
+    cells = [SimpleNamespace(seconds=s, outputs=[]) for s in (5, 1, 1_000, 1)]
+    errors = check.run(cells, None, seconds=6, total=14)
+    assert errors == {2: ("", "ran longer than 6 s"), 3: ("", check.NOT_RUN)}
 
 
 def test_without_solutions_a_changed_check_earns_nothing(tmp_path, capsys, monkeypatch):

@@ -60,6 +60,13 @@ def test_an_unknown_kind_of_score_is_refused_by_name():
         st.scores(table(DDPG_0=[1]), "best_of")
 
 
+def test_a_score_over_two_variants_is_refused_by_their_names():
+    rows = pd.concat([table(DDPG_0=[1, 2]), table(DDPG_0=[3]).assign(variant="frozen")])
+    for kind in ("end", "whole", "final", "maximum", "spread"):
+        with pytest.raises(ValueError, match="class, frozen"):
+            st.scores(rows, kind)
+
+
 def test_a_block_that_is_not_full_is_dropped():
     assert st.block_means([1, 3, 5, 7, 100], block=2).tolist() == [2, 6]
     assert st.block_means([1], block=2).tolist() == []

@@ -1,5 +1,6 @@
 """The recorded study: it loses nothing, doubles nothing, and repeats itself exactly."""
 
+import errno
 import itertools
 import json
 import multiprocessing
@@ -207,6 +208,23 @@ def test_episodes_losses_and_versions_are_recorded(undisturbed, runs):
     assert Config.from_json(json.dumps(meta["config"])) == runs[0].config
 
 
+@pytest.mark.parametrize("task", ["Hopper-v5", "Pendulum-v1"])
+def test_a_run_of_so_many_episodes_is_measured_in_full_at_its_four_quarters(
+        task, tmp_path):
+    choices = dict(steps=None, episodes=8, max_episode_steps=20, evaluate_every=10)
+    run = tiny("DN-DDPG", task=task, **choices)
+    study.record(run, tmp_path, tmp_path / "scratch")
+    table = study.load_study(variant="tiny", folder=tmp_path)
+    last = study.load_study(variant="tiny", what="episodes", folder=tmp_path)[0]["step"]
+    assert table.step.is_unique and table.step.max() == last[-1]  # 100 %: the very end
+    if task == "Pendulum-v1":  # its equations are known: everything, each time
+        rows = study.load_study(variant="tiny", what="bias", folder=tmp_path,
+                                rule="max_min")
+        assert set(rows.step) == set(table.step)
+    else:
+        assert list(table.quarter.unique()) == [0, 1, 2, 3, 4]
+
+
 def test_a_record_names_neither_the_machine_nor_its_folders(undisturbed, runs):
     import platform
 
@@ -317,9 +335,11 @@ def test_what_a_kill_left_half_written_is_swept_away(tmp_path, runs):
     run = runs[0]
     checkpoint = study.Checkpoint(run, tmp_path, tmp_path / "scratch")
     path = path_of(run, tmp_path)
-    path.parent.mkdir(parents=True)
-    litter = [path.with_name(f".{path.name}.1234.part"),
-              checkpoint.training.with_name(f".{checkpoint.training.name}.99.part")]
+    litter = []  # the names under which write_npz writes
+    for whole in (path, checkpoint.training, checkpoint.notes):
+        whole.parent.mkdir(parents=True, exist_ok=True)
+        study.write_npz(whole, save=lambda file: litter.append(Path(file.name)))
+        whole.unlink()
     for part in litter:
         part.write_bytes(b"half")
     study.record(run, tmp_path, tmp_path / "scratch")
@@ -465,6 +485,41 @@ def test_without_a_common_folder_the_study_writes_what_the_worker_sends(
     assert what == "done" and not (tmp_path / "far").exists()
     study.write_record(path_of(runs[0], tmp_path), arrays)
     assert_same_record(path_of(runs[0], undisturbed), path_of(runs[0], tmp_path))
+    # Lost on the way? Whoever asks again gets the same, and waits for no training.
+    what, again = study.record(runs[0], tmp_path / "far", tmp_path / "scratch",
+                               write=False)
+    assert what == "done" and again.keys() == arrays.keys()
+    for name in arrays:
+        np.testing.assert_array_equal(again[name], arrays[name])
+
+
+def test_a_record_that_lies_on_the_workers_machine_only_is_sent(tmp_path, runs,
+                                                                undisturbed):
+    _, arrays = study._work(runs[0], str(undisturbed), tmp_path / "scratch", 120)
+    study.write_record(path_of(runs[0], tmp_path), arrays)
+    assert_same_record(path_of(runs[0], undisturbed), path_of(runs[0], tmp_path))
+
+
+def test_a_kill_just_before_the_checkpoint_goes_leaves_nothing_behind(
+        tmp_path, runs, undisturbed):
+    run, scratch = runs[0], tmp_path / "scratch"
+    checkpoint = study.Checkpoint(run, undisturbed, scratch)
+    scratch.mkdir()
+    checkpoint.training.write_bytes(b"of a run that is recorded")
+    assert study.record(run, undisturbed, scratch) == ("done", None)
+    assert not checkpoint.training.exists()
+
+
+def test_a_file_system_without_locks_is_named_and_not_waited_for(
+        tmp_path, runs, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+
+    def no_locks(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with pytest.raises(OSError, match="not implemented"):
+        study.record(runs[0], tmp_path, tmp_path / "scratch")
 
 
 # --- damaged, foreign, malicious ------------------------------------------------------
@@ -490,7 +545,7 @@ def test_a_record_of_no_use_is_named_and_skipped(tmp_path, undisturbed, runs,
     np.savez(folder / "DDPG-7.npz", weights=np.ones(3))
     (folder / "DDPG-8.npz").mkdir()
     (folder / "DDPG-0 (copy).npz").write_bytes(good)
-    (folder / ".DDPG-9.npz.77.part").write_bytes(b"half")
+    (folder / "DDPG-9.npz.77.part").write_bytes(b"half")
     (folder / "DDPG-0.npz").write_bytes(good)
     for what in records.WHAT:
         with pytest.warns(UserWarning) as caught:

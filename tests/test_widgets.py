@@ -33,6 +33,13 @@ def test_the_laboratory_refuses_a_quantity_that_it_does_not_have():
         widgets.maximisation_laboratory(gamma=0.9)
 
 
+@pytest.mark.parametrize("rule", ["selected", "paired_min"])
+def test_the_laboratory_refuses_actors_without_a_critic_of_their_own(rule):
+    with pytest.raises(ValueError, match="a critic for each actor"):
+        widgets.maximisation_laboratory(rule=rule)
+    widgets.maximisation_laboratory(("sigma", "rho"), rule, critics=2, actors=2)
+
+
 def test_every_control_of_the_explorer_changes_text_and_picture():
     if not load_study("Pendulum-v1", what="weights"):
         pytest.skip("no weights of Pendulum are recorded")
@@ -77,6 +84,27 @@ def test_live_training_starts_only_when_asked_and_pauses_and_stops():
     panel.stop_button.click()
     wait_until(lambda: "Over at step" in panel.text.value)
     assert 0 < panel.training.step < config.steps
+
+
+def test_start_is_heard_right_after_stop_and_pause_forgets_what_it_was():
+    config = Config("Pendulum-v1", "DDPG", steps=100_000, warmup=100, hidden=(16, 16),
+                    yield_every=20, evaluate_every=100)
+    panel = widgets.live_training(config)
+    panel.stop_button.click()  # nothing runs yet: nothing happens
+    panel.start_button.click()
+    wait_until(lambda: panel.progress.value >= 100)
+    first = panel.training
+    panel.pause_button.click()
+    panel.stop_button.click()
+    assert panel.pause_button.description == "pause"
+    panel.start_button.click()  # while the first run may still be evaluating
+    wait_until(lambda: panel.training is not first and panel.progress.value >= 100)
+    panel.stop_button.click()
+
+
+def test_the_panel_refuses_a_run_whose_steps_it_cannot_count():
+    with pytest.raises(ValueError, match="give steps instead"):
+        widgets.live_training(Config("Pendulum-v1", episodes=3))
 
 
 def test_a_run_that_breaks_off_says_so_in_the_panel():
