@@ -173,14 +173,17 @@ def run(cells, folder, seconds, total):
                 if index in left_out:
                     continue
                 left = int(end - time.monotonic())  # nbclient wants whole seconds
-                if left < 1:
-                    if error := known.get(index, ("", NOT_RUN)):
-                        errors[index] = error
-                    continue
                 client.timeout = min(seconds, left)
                 try:
+                    if left < 1:
+                        raise CellTimeoutError
                     client.execute_cell(cell, index)
                 except CellTimeoutError:
+                    if left < 1 or index in known:  # the time is over for all cells
+                        end = time.monotonic()
+                        if error := known.get(index, ("", NOT_RUN)):
+                            errors[index] = error
+                        continue
                     left_out[index] = "", f"ran longer than {client.timeout} s"
                     break
                 except DeadKernelError:
