@@ -65,12 +65,27 @@ def train(
                          f"it: {command('train --resume', out)}")
     check_can_write(out)
     if resume is None:
+        try_out(config)
         return run(Training(config), out)
     training = Training.load(resume)
     if config not in (Config(), training.config):
         raise ValueError(f"--resume goes on with the run in {resume} as it was "
                          "configured: leave the other options out.")
     return run(training, out)
+
+
+def try_out(config):
+    """ValueError where the task does not begin, whatever it raises."""
+    try:
+        with closing(make_env(config)) as env:
+            env.reset(seed=0)
+            env.step(env.action_space.sample())
+    except ValueError:  # our own sentence, or the task's
+        raise
+    except Exception as error:
+        raise ValueError(f"task={config.task!r} does not begin with task_options="
+                         f"{config.task_options}: {type(error).__name__}: {error}."
+                         ) from error
 
 
 def run(training, out):
@@ -147,6 +162,9 @@ def watch(
         episodes: how many to show.
         seed: of the first episode's start; the next episode has the next number.
     """
+    if episodes < 1 or seed < 0:
+        raise ValueError(f"episodes={episodes}, seed={seed}: expected 1 or more, and 0 "
+                         "or more.")
     agent = NumpyAgent.load(file)  # also opens a PyTorch agent, and needs no PyTorch
     starts = range(seed, seed + episodes)
     if film is None:
@@ -213,6 +231,9 @@ def main(argv: list[str] | None = None) -> int:
         )
     except (ValueError, OSError, ImportError) as error:
         print(f"dnddpg_minimal: {in_words(error)}", file=sys.stderr)
+        return 2
+    except MemoryError as error:
+        print(f"dnddpg_minimal: not enough memory: {in_words(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return INTERRUPTED

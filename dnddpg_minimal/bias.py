@@ -46,7 +46,15 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from . import arm
-from .dnddpg import PROBE_TASKS, choose_actor, make_env, stream, td_target, to_env
+from .dnddpg import (
+    PROBE_TASKS,
+    choose_actor,
+    is_mujoco,
+    make_env,
+    stream,
+    td_target,
+    to_env,
+)
 
 STEPS = 500  # horizon of the truth
 NEGLIGIBLE = 1e-7  # a reward of smaller weight is lost in float32: the sum stops there
@@ -275,7 +283,7 @@ def rollout(world, states, policy, gamma, steps=None, first_action=None):
     states (N, S); policy obs (B, O) -> action (B, A) in [-1, 1]; first_action (N, A)
     is done first if it is given. A row whose world has ended earns nothing more.
     One rollout serves two quantities; a dict of arrays (N,):
-        truth     discounted sum of `steps` rewards; time limits are passed over
+        truth     discounted sum of up to `steps` rewards; time limits are passed over
         returns   plain sum of the first `world.limit` rewards; on Arm up to success
         ended     did the world really end?
         success   Arm: more than 50 steps in a row on the goal, within the limit
@@ -290,6 +298,7 @@ def rollout(world, states, policy, gamma, steps=None, first_action=None):
     rows = np.arange(n)  # the rows whose world goes on; `states` holds only these
     for t in range(steps):
         if t >= limit and gamma**t < NEGLIGIBLE:
+            steps = t  # the rest is too small to be seen
             break
         if t == 0 and first_action is not None:
             action = first_action
@@ -563,7 +572,7 @@ def _by_episodes(agent, common, rng, kept, full):
     limit = env.spec.max_episode_steps or 2 * STEPS
     # The time limit is bypassed; we count the steps of a return ourselves.
     endless = env.env if isinstance(env, gymnasium.wrappers.TimeLimit) else env
-    simulator = hasattr(env.unwrapped, "model") and hasattr(env.unwrapped, "data")
+    simulator = is_mujoco(env)
 
     returns, q_means, truth_means, largest = [], [], [], 0.0
     episodes = EPISODES_MUJOCO if simulator else EPISODES_OTHER
@@ -681,7 +690,7 @@ def take_apart(agent, world, states):
     A dict: `above` (N,), the first sum, how far the critics lie above their own
     targets; `rule` (N,), the second one; `bias` (N,), both together; `delta` (T, N).
     All in units of return. What comes after the horizon counts as the first sum.
-    ValueError where a world ends on the way: the sums are those of an endless path.
+    ValueError where some worlds end before others: the sums are of an endless path.
     """
     config, n = agent.config, len(states)
     rows, nothing = np.arange(n), np.zeros(n)  # no reward, no end: y is the rule itself

@@ -132,19 +132,19 @@ class Config:
     max_episode_steps: int | None = None  # time limit; None: the task's own
     task_options: dict[str, Any] | None = None  # passed to the environment
     hidden: tuple[int, ...] | None = None  # widths of the hidden layers
-    batch_size: int | None = None  # B, transitions in one update
+    batch_size: int | None = None  # B, transitions in one update, 1 or more
     gamma: float | None = None  # γ, discount of one step, 0 to 1
     tau: float | None = None  # τ of Eq. (1), 0 < τ <= 1; 1 copies outright
-    target_every: int = 1  # updates between two moves of the slow copies
-    critic_lr: float = 1e-3  # learning rate of the critics (Adam)
-    actor_lr: float = 1e-3  # learning rate of the actors (Adam)
+    target_every: int = 1  # updates between two moves of the slow copies, 1 or more
+    critic_lr: float = 1e-3  # α, learning rate of the critics (Adam), 0 < α <= 1
+    actor_lr: float = 1e-3  # α, learning rate of the actors (Adam), 0 < α <= 1
     warmup: int | None = None  # first steps: uniform actions, no update
     buffer_size: int | None = None  # transitions in replay; None: min(steps, 100 000)
     updates_per_step: int = 1  # updates after each step
     noise: str | None = None  # exploration: gaussian, or ou (Ornstein-Uhlenbeck)
-    sigma: float | None = None  # σ of the noise, in units of half the action range
+    sigma: float | None = None  # σ of the noise, 0 or more, in half action ranges
     theta: float = 0.15  # θ of the OU noise, pull towards 0 in one step, 0 to 1
-    noise_decay: float = 1.0  # noise is multiplied by this after each episode
+    noise_decay: float = 1.0  # factor of the noise after each episode, 0 < it <= 1
     target_rule: str = "max_min"  # max_min, single, paired_min, selected or soft
     act_rule: str = "paired"  # paired (Eq. 12 as printed), max_min or first
     climbs: str = "own"  # actor k climbs critic k (own), or all climb the first
@@ -177,7 +177,6 @@ class Config:
                 raise ValueError(_not_allowed(name, mine[name], allowed))
         self._check_the_rest()
         mine["hidden"] = tuple(int(width) for width in self.hidden)
-        mine["task_options"] = dict(self.task_options or {})
 
     def _networks(self):
         """C, K and the algorithm's name, from whichever of them were given."""
@@ -209,9 +208,13 @@ class Config:
         if not (hidden and all(isinstance(h, Integral) and h >= 1 for h in hidden)):
             raise ValueError(f"hidden={self.hidden!r} is not allowed: expected widths "
                              "such as (64, 64), whole numbers of 1 or more.")
-        if not isinstance(self.task_options, dict | None):
+        try:  # now, as a file will hold them: tuples become lists
+            options = json.loads(json.dumps(self.task_options or {}))
+            vars(self)["task_options"] = dict(options)
+        except (TypeError, ValueError) as error:
             raise ValueError(f"task_options={self.task_options!r} is not allowed: "
-                             "expected a dict such as {'goal_area': 'window'}.")
+                             "expected a dict such as {'goal_area': 'window'}, of what "
+                             f"JSON can hold ({error}).") from error
         if self.actors > self.critics:
             raise ValueError(f"actors={self.actors} with critics={self.critics}: actor "
                              "k climbs critic k, so expected actors <= critics.")
@@ -385,7 +388,10 @@ def size_of(count, sizes):
 
 
 def first_weights(layers, generators):
-    """Fill the layers: network n from generators[n], uniform in ±1/sqrt(inputs)."""
+    """Fill the layers: network n from generators[n], uniform in ±1/sqrt(inputs).
+
+    As PyTorch's Linear does. The column of ones is not counted as an input.
+    """
     for n, rng in enumerate(generators):
         for layer in layers:
             bound = 1 / math.sqrt(layer.shape[1] - 1)
@@ -394,12 +400,10 @@ def first_weights(layers, generators):
 
 def join(obs, action=None):
     """A network's input: obs (B, O), action (..., B, A) if given, a column of ones."""
-    shape = obs.shape if action is None else action.shape
-    width = obs.shape[1] + (0 if action is None else shape[-1])
-    x = np.ones((*shape[:-1], width + 1), obs.dtype)
+    action = obs[:, :0] if action is None else action  # (B, 0): no columns
+    x = np.ones((*action.shape[:-1], obs.shape[1] + action.shape[-1] + 1), obs.dtype)
     x[..., :obs.shape[1]] = obs
-    if action is not None:
-        x[..., obs.shape[1]:-1] = action
+    x[..., obs.shape[1]:-1] = action
     return x
 
 
@@ -407,7 +411,7 @@ def forward(layers, x, scratch=None):
     """x (..., B, in + 1) through N networks: the list [x, h, h, ..., z].
 
     ReLU after every layer but the last; h (N, B, H + 1), z (N, B, out). `scratch`, a
-    dict, lends the memory for every h again at the next call.
+    dict, lends the memory for every h again at the next call, which overwrites it.
     """
     scratch = {} if scratch is None else scratch
     activations = [x]
@@ -426,9 +430,10 @@ def forward(layers, x, scratch=None):
 def backward(layers, activations, dz, dlayers=None, inputs=None, scratch=None):
     """The chain rule from the last layer to the first.
 
-    `dz` (N, B, out) is the loss's gradient with respect to z. With `dlayers` the
-    gradients of the layers are written there. With `inputs`, a slice, the gradient
-    with respect to those columns of x is returned, (N, B, columns).
+    `activations` is what `forward` returned, and `dz` (N, B, out) the loss's gradient
+    with respect to z. With `dlayers` the gradients of the layers are written there,
+    over what was there. With `inputs`, a slice, the gradient with respect to those
+    columns of x is returned, (N, B, columns). `scratch` lends memory, as in `forward`.
     """
     scratch = {} if scratch is None else scratch
     for i in reversed(range(len(layers))):
@@ -449,16 +454,14 @@ def backward(layers, activations, dz, dlayers=None, inputs=None, scratch=None):
 def adam(theta, dtheta, m, v, t, lr, beta1=0.9, beta2=0.999, eps=1e-8):
     """Step t = 1, 2, ... of Adam on a flat vector, in place (Kingma and Ba 2015).
 
-    As PyTorch's: moments are bias-corrected, eps stands outside the square root.
-    Overwrites dtheta.
+    theta, its gradient dtheta, and the moments m and v are (P,). As PyTorch's: moments
+    are bias-corrected, eps stands outside the square root. Overwrites dtheta.
     """
     correction = math.sqrt(1 - beta2**t)
     m *= beta1
     m += (1 - beta1) * dtheta
     v *= beta2
-    dtheta *= dtheta
-    dtheta *= 1 - beta2
-    v += dtheta
+    v += (1 - beta2) * dtheta**2
     step = np.sqrt(v, out=dtheta)
     step += eps * correction
     np.divide(m, step, out=step)
@@ -483,14 +486,19 @@ def td_target(reward, terminated, q_next, gamma, rule="max_min", nu=0.1, y_min=N
         selected    the min at the action that Eq. (12) picks
         soft        (1 - ν) · max + ν · min, over actors, of the min
 
-    With C = K = 1 all of them are DDPG's target. `reward` and `terminated` are (B,),
-    `y_min` is a lower limit of y. Returns y (B,), in units of return.
-    Raises ValueError for shapes that do not match and for a y that is not finite.
+    With C = K = 1 all of them are DDPG's target. `reward` and `terminated` are (B,);
+    `terminated` is 1 or True where the world ended. `gamma` is the discount of one
+    step, `y_min` a lower limit of y. Returns y (B,), in units of return. Raises
+    ValueError for an unknown rule, shapes that do not match, a `terminated` that is
+    neither 0 nor 1, and a y that is not finite.
     """
     reward, ends, q_next = map(np.asarray, (reward, terminated, q_next))
-    if not (q_next.ndim == 3 and reward.shape == ends.shape == q_next.shape[2:]):
+    if not (q_next.ndim == 3 and reward.shape == ends.shape == q_next.shape[2:]
+            and q_next.size > 0):
         raise ValueError("td_target expects shapes (B,), (B,) and (C, K, B); got "
                          f"{reward.shape}, {ends.shape} and {q_next.shape}.")
+    if not ((ends == 0) | (ends == 1)).all():
+        raise ValueError(f"terminated={ends!r}: expected 0 or 1 for each transition.")
     actors = q_next.shape[1]
     lowest = q_next.min(axis=0)  # (K, B), over critics
     if rule == "max_min":
@@ -523,9 +531,14 @@ def choose_actor(q, rule="paired"):
         paired   argmax over k of critic k at actor k's action   Eq. (12) as printed
         max_min  argmax over k of the min over all critics
         first    always the first actor
+
+    Raises ValueError for another rule, and if `paired` finds more actors than critics.
     """
     actors = range(q.shape[1])
     if rule == "paired":
+        if len(actors) > len(q):
+            raise ValueError("'paired' needs a critic for each actor; got q "
+                             f"{q.shape}, axes (C, K, B).")
         return q[actors, actors].argmax(axis=0)  # over actors
     if rule == "max_min":
         return q.min(axis=0).argmax(axis=0)
@@ -624,6 +637,9 @@ class Agent:
         if array.ndim != 2 or array.shape[1] != width:
             raise ValueError(f"{name} has shape {array.shape}: expected ({width},) or "
                              f"(B, {width}).")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} holds {array[~np.isfinite(array)][0]!r}: "
+                             "expected finite numbers.")
         return array
 
     def _act(self, obs, slow=False):
@@ -645,12 +661,15 @@ class Agent:
     def update(self, batch, climb=True):
         """One update: critics, then actors (if `climb`), then slow copies.
 
-        Returns the losses, "critic" (C,) and "actor" (K,): NaN without a climb.
+        Returns the losses, "critic" (C,) and "actor" (K,): NaN without a climb. Raises
+        ValueError for a batch that is not finite, before anything has changed.
         """
         config = self.config
         batch = Batch(*(np.asarray(part, self.dtype) for part in batch))
-        self.updates += 1
+        self._rows(batch.obs, self.obs_dim, "obs")
+        self._rows(batch.action, self.action_dim, "action")
         y = self.td_target(batch)  # (B,)
+        self.updates += 1
         losses = {"critic": self.fit_critics(batch, y),  # Eq. (3)
                   "actor": np.full(config.actors, np.nan)}
         if climb:
@@ -738,13 +757,22 @@ class NumpyAgent(Agent):
 
 
 class TorchAgent(Agent):
-    """The same update by autograd, on `config.device`."""
+    """The same update by autograd, on `config.device`.
 
-    def _array(self, array):
+    Raises ValueError if PyTorch does not find that device here.
+    """
+
+    def __init__(self, config, obs_dim, action_dim):
         import torch
 
-        self.torch, dtype = torch, getattr(torch, self.config.dtype)
-        return torch.tensor(array, dtype=dtype, device=self.config.device)
+        self.torch, device = torch, torch.device(config.device)
+        if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+            raise ValueError(f"device={config.device!r}: PyTorch finds no such GPU.")
+        super().__init__(config, obs_dim, action_dim)
+
+    def _array(self, array):
+        dtype = getattr(self.torch, self.config.dtype)
+        return self.torch.tensor(array, dtype=dtype, device=self.config.device)
 
     def _numpy(self, tensor):
         return tensor.detach().cpu().numpy().copy()
@@ -796,9 +824,8 @@ class TorchAgent(Agent):
 
     def _descend(self, loss, layers, optimizer):
         """One step down. No gradient is kept for anyone else's weights."""
-        gradients = self.torch.autograd.grad(loss, layers)
-        for layer, gradient in zip(layers, gradients, strict=True):
-            layer.grad = gradient
+        optimizer.zero_grad()
+        loss.backward(inputs=layers)
         optimizer.step()
 
 
@@ -859,6 +886,11 @@ def make_env(config, render_mode=None):
     return env
 
 
+def is_mujoco(env):
+    """True if the task runs in MuJoCo."""
+    return type(getattr(env.unwrapped, "model", None)).__module__.startswith("mujoco")
+
+
 def simulator_state(env):
     """The task's whole state as arrays: (state (S,), MuJoCo's xipos (bodies, 3)).
 
@@ -866,8 +898,12 @@ def simulator_state(env):
     be kept too. Both are empty for a task that shows no state.
     """
     inner = env.unwrapped
-    if not (hasattr(inner, "model") and hasattr(inner, "data")):
-        return np.array(getattr(inner, "state", ()), float).ravel(), np.empty((0, 3))
+    if not is_mujoco(env):
+        try:
+            state = np.array(getattr(inner, "state", ()), float).ravel()
+        except (TypeError, ValueError):  # something else is called `state` there
+            state = np.empty(0)
+        return state, np.empty((0, 3))
     import mujoco
 
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -884,7 +920,7 @@ class Record(NamedTuple):
 
     `kind` is "episode" (its end), "grid" (a multiple of `evaluate_every`) or
     "progress". Return, length and losses are of the episode, so far if it still runs;
-    losses are means over its updates, NaN if there were none.
+    losses are means over its updates, NaN if there were none, or if not all had one.
     """
 
     kind: str
@@ -900,6 +936,7 @@ class Record(NamedTuple):
 KEPT = 64  # simulator states kept for the measurement of bias,
 KEEP_EVERY = 156  # one from so many steps: 64 from the last 10 000
 FIRST_LOSSES = 20  # critic losses kept from the start of the run
+LARGEST = 1e38  # more than this does not fit into float32
 
 
 class Training:
@@ -947,13 +984,20 @@ class Training:
 
     def __next__(self) -> Record:
         with self._threads.limit(limits=1):  # one run, one thread
-            return next(self._loop)
+            record = next(self._loop, None)
+        if record is None and not self.finished:
+            raise RuntimeError(f"This run broke off at step {self.step}: save(path), "
+                               "then Training.load(path) goes on.")
+        if record is None:
+            raise StopIteration
+        return record
 
     def _run(self):
         config = self.config
         while not self.finished:
             seed = int(self.streams["environment"].integers(2**31))
             obs, _ = self.env.reset(seed=seed)
+            self._check(obs)
             self.noise.reset()
             self._return, self._length, over = 0.0, 0, False
             self._losses = [np.zeros(count, self.agent.dtype)  # sums
@@ -980,9 +1024,7 @@ class Training:
         self.step += 1
         next_obs, reward, terminated, truncated, _ = self.env.step(
             to_env(action, self.env.action_space))
-        if not (math.isfinite(reward) and np.isfinite(next_obs).all()):
-            raise ValueError(f"step {self.step} of {config.task!r}: reward {reward!r}, "
-                             f"observation {next_obs!r}: expected finite numbers.")
+        self._check(next_obs, reward)
         over = bool(terminated or truncated)
         end = {"terminated": terminated, "none": False, "any_end": over}[config.ends]
         self._store(obs, action, reward, next_obs, end)
@@ -992,6 +1034,12 @@ class Training:
             for _ in range(config.updates_per_step):
                 self._update()
         return next_obs, over
+
+    def _check(self, obs, reward=0.0):
+        if not (abs(reward) < LARGEST and (np.abs(obs) < LARGEST).all()):  # nor is NaN
+            raise ValueError(f"step {self.step} of {self.config.task!r}: reward "
+                             f"{reward!r}, observation {obs!r}: expected finite "
+                             f"numbers below {LARGEST:g}.")
 
     def _explore(self, obs):
         """The action to execute, (A,): uniform at first, then greedy + noise."""

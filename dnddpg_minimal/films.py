@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dnddpg_minimal.dnddpg import make_env, to_env
+from dnddpg_minimal.dnddpg import is_mujoco, make_env, to_env
 from dnddpg_minimal.records import FILMED, RECORDINGS, load_agent_at, load_study
 
 FILM_LENGTH = 200  # pictures at most
@@ -28,7 +28,10 @@ SHORTEST_PICTURE = 20  # milliseconds; viewers slow down a film that is faster
 
 
 def play(agent, env, seed):
-    """One episode of the greedy policy from one start; yields each step's reward."""
+    """One greedy episode of an agent in env, without noise; yields each step's reward.
+
+    `seed` is that of its start, as in `env.reset`.
+    """
     obs, _ = env.reset(seed=seed)
     over = False
     while not over:
@@ -39,7 +42,7 @@ def play(agent, env, seed):
 
 
 def write_film(path, pictures, seconds, width=FILM_WIDTH):
-    """Write a GIF of the pictures, each (height, width, 3) uint8, with one palette.
+    """Write the pictures, each (height, width, 3) uint8, to the GIF at `path`.
 
     seconds: how long each picture stays; width: in pixels, at most.
     """
@@ -61,13 +64,16 @@ def write_film(path, pictures, seconds, width=FILM_WIDTH):
 
 
 def make_camera_env(config):
-    """An environment that draws without a window. ValueError if that can't be done."""
+    """An environment of `config.task` that draws without a window.
+
+    ValueError if that can't be done, with what is missing.
+    """
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # before pygame is imported
     if not has_display():
         os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported
     try:
         env = make_env(config, render_mode="rgb_array")
-        if hasattr(env.unwrapped, "model"):  # MuJoCo on a CPU: 4 times as fast without
+        if is_mujoco(env):  # MuJoCo on a CPU: 4 times as fast without
             quality = env.unwrapped.model.vis.quality  # fine shadows and fine edges,
             quality.shadowsize, quality.offsamples = 512, 0  # and shrinking smooths too
             follow_with_camera(env.unwrapped)
@@ -85,7 +91,7 @@ def make_camera_env(config):
 
 
 def follow_with_camera(env):
-    """Look through the model's own camera "track", if it has one.
+    """Look at env, of MuJoCo, through the model's own camera "track", if it has one.
 
     Gymnasium 1.4 looks through a free camera, from which HalfCheetah runs away.
     """
@@ -109,7 +115,7 @@ def check_display():
 
 def window_closed(env):
     """Has the user closed the window that `env` draws in? (Gymnasium does not look.)"""
-    if hasattr(env.unwrapped, "mujoco_renderer"):
+    if is_mujoco(env):
         import glfw
 
         viewer = env.unwrapped.mujoco_renderer.viewer
@@ -156,7 +162,10 @@ def film(task, algorithm="DN-DDPG", variant="class", seed=0, folder=None):
 
 
 def film_all(folder=None):
-    """Film the recorded agents that the book shows; says which could not be. → 0."""
+    """Film the recorded agents that the book shows; says which could not be. → 0.
+
+    `folder` holds recordings, by default those of the package.
+    """
     for name in FILMED:
         task, variant, file = name.split("/")
         algorithm, seed = file.rsplit("-", 1)

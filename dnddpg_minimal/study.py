@@ -134,8 +134,8 @@ def _class():
     from dnddpg_minimal.bugs import ABLATIONS, BUGS
 
     pendulum, arm, car, cheetah = TASKS[:1], TASKS[1:2], TASKS[3:4], MUJOCO_TASKS[:1]
-    hopper, walker, humanoid = (MUJOCO_TASKS[i:i + 1] for i in (1, 2, 3))
-    ddpg, dcn, dn = ((name,) for name in ALGORITHMS)
+    hopper, walker, others = MUJOCO_TASKS[1:2], MUJOCO_TASKS[2:3], MUJOCO_TASKS[3:]
+    ddpg, dcn, dn = ("DDPG",), ("DCN-DDPG",), ("DN-DDPG",)
     short = dict(steps=20_000)
     slow = dict(tau=0.01, target_every=10)
     success = dict(success_terminates=True)
@@ -144,7 +144,7 @@ def _class():
     large = dict(steps=50_000, hidden=(400, 300), batch_size=256)
 
     runs = _many(10, (*SMALL, *cheetah, *hopper, *walker), ALGORITHMS, "class")
-    runs += _many(5, (*car, *humanoid), ALGORITHMS, "class")
+    runs += _many(5, (*car, *others), ALGORITHMS, "class")
     # The choices of readings.md, one at a time
     for field, values in (("target_rule", ("single", "paired_min", "selected", "soft")),
                           ("act_rule", ("max_min", "first")), ("climbs", ("first",)),
@@ -168,7 +168,7 @@ def _class():
     runs += _many(10, pendulum, dcn, "updates_per_step=2", updates_per_step=2)
     runs += _many(10, pendulum, ALGORITHMS, "frozen", freeze_actors_after=20_000)
     runs += _many(1, (*cheetah, *hopper), ALGORITHMS, "frozen", **frozen)
-    runs += _many(1, (*walker, *humanoid), dn, "frozen", **frozen)
+    runs += _many(1, (*walker, *others), dn, "frozen", **frozen)
     # Chapters 03 and 12
     for name, fields in ABLATIONS.items():
         runs += _many(5, pendulum, ddpg, f"ablation={name}", **fields, **short)
@@ -857,6 +857,10 @@ def tell(runs, missing, folder, scratch, timed, workers):
             hours = sum(seconds_of(run.config) for run in todo) / 3600
             line, total = f"{line}{hours:9.2f} core-hours to do", total + hours
         print(line, flush=True)
+        for algorithm in dict.fromkeys(run.config.algorithm for run in todo):
+            seeds = [run.config.seed for run in todo
+                     if run.config.algorithm == algorithm]
+            print(f"    to do: {algorithm}, seeds {', '.join(map(str, seeds))}")
     for run in missing:
         part = Checkpoint(run, folder, scratch).progress()
         if part > 0:

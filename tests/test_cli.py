@@ -89,6 +89,10 @@ def test_help_needs_neither_torch_nor_a_simulator():
     (["--steps", "10", "--episodes", "3"], "give one of the two"),
     (["--critics", "1", "--actors", "2"], "actors <= critics"),
     (["--task-options", "colour=red"], "colour"),
+    (["--task-options", "g=abc"], "does not begin with task_options={'g': 'abc'}"),
+    (["--task", "Hopper-v5", "--task-options", "frame_skip=0"], "ZeroDivisionError"),
+    (["--task", "Hopper-v5", "--task-options", "reset_noise_scale=abc"], "'abc'"),
+    (["--buffer-size", "1000000000000"], "not enough memory"),
     (["--out", "no-such-folder/a.npz"], "no-such-folder"),
     (["--resume", "no-such-file.npz"], "no-such-file.npz: No such file"),
 ])
@@ -251,6 +255,12 @@ def test_watch_writes_a_film_and_prints_the_return(trained, tmp_path):
 
 def test_a_film_must_be_a_gif(trained, capsys):
     assert ".gif" in fails_in_one_line(capsys, "watch", trained[0], "--film", "a.mp4")
+
+
+@pytest.mark.parametrize("words", [("--seed", -1), ("--episodes", 0)])
+def test_watch_refuses_a_start_and_a_number_that_do_not_exist(trained, capsys, words):
+    said = fails_in_one_line(capsys, "watch", trained[0], "--film", "a.gif", *words)
+    assert "expected 1 or more" in said
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is a display")

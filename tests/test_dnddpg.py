@@ -133,6 +133,21 @@ def test_a_target_that_is_not_finite_is_refused():
             td_target(np.array([1.0, bad]), GO_ON, Q_NEXT, 0.5)
 
 
+@pytest.mark.parametrize("bad", [0.5, -1, math.nan])
+def test_an_end_is_0_or_1(bad):
+    with pytest.raises(ValueError, match="expected 0 or 1"):
+        td_target(REWARD, np.array([0, bad]), Q_NEXT, 0.5)
+
+
+def test_more_actors_than_critics_are_refused_where_each_needs_its_own():
+    q = np.zeros((1, 2, 2))  # (C, K, B)
+    with pytest.raises(ValueError, match=r"a critic for each actor; got q \(1, 2, 2\)"):
+        choose_actor(q, "paired")
+    for rule in ("selected", "paired_min"):
+        with pytest.raises(ValueError, match="actor"):
+            td_target(REWARD, GO_ON, q, 0.5, rule)
+
+
 def test_a_wrong_rule_is_answered_with_the_nearest_right_one():
     with pytest.raises(ValueError, match="'minmax'.*'max_min'.*'single'"):
         td_target(REWARD, GO_ON, Q_NEXT, 0.5, "minmax")
@@ -753,6 +768,35 @@ def test_an_update_without_climbing_leaves_the_actors_alone(kind):
     assert np.isnan(losses["actor"]).all()
     np.testing.assert_array_equal(agent.actions(batch.obs), actions)
     assert (agent.q_values(batch.obs, batch.action) != q).all()
+
+
+@AGENTS
+@pytest.mark.parametrize("part", Batch._fields)
+def test_a_batch_with_nan_is_refused_before_anything_has_changed(kind, part):
+    agent, batch = tiny_agent(kind), random_batch()
+    before = agent.arrays()
+    bad = np.array(getattr(batch, part), float)
+    bad.flat[0] = math.nan
+    with pytest.raises(ValueError, match="nan"):
+        agent.update(batch._replace(**{part: bad}))
+    np.testing.assert_equal(agent.arrays(), before)
+    with pytest.raises(ValueError, match="obs holds .*nan"):
+        agent.act(np.full(agent.obs_dim, math.nan))
+
+
+def test_a_gpu_that_is_not_there_is_named():
+    torch = pytest.importorskip("torch")
+    device = f"cuda:{torch.cuda.device_count()}"
+    with pytest.raises(ValueError, match=f"'{device}': PyTorch finds no such GPU"):
+        make_agent(Config(backend="torch", device=device), 3, 1)
+
+
+def test_options_of_a_task_are_kept_as_a_file_holds_them():
+    config = Config("Hopper-v5", task_options={"healthy_z_range": (0.7, 2.0)})
+    assert Config.from_json(config.to_json()) == config
+    for lost in ({"g": np.float32(9.8)}, {"path": dataclasses}, [1], "g=9"):
+        with pytest.raises(ValueError, match="task_options=.*is not allowed"):
+            Config(task_options=lost)
 
 
 @AGENTS

@@ -4,6 +4,7 @@ from a run that was killed and went on.
 
 import math
 import random
+import re
 import subprocess
 import sys
 import time
@@ -372,9 +373,10 @@ def test_which_steps_are_kept_is_drawn_from_the_seed_alone():
 # --- what a task must not return ------------------------------------------------------
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300])
 def test_a_reward_that_is_not_finite_stops_the_run_by_step_and_value(bad):
-    with pytest.raises(ValueError, match=f"step 23 .*Toy-v0.*reward .*{bad}"):
+    said = f"step 23 of 'Toy-v0': reward {bad!r}"  # 1e300 does not fit into float32
+    with pytest.raises(ValueError, match=re.escape(said)):
         toy_run(task_options=dict(bad_step=23, bad_reward=bad))
 
 
@@ -384,21 +386,58 @@ def test_an_observation_that_is_not_finite_stops_the_run_by_step_and_value(bad):
         toy_run(task_options=dict(bad_step=23, bad_obs=bad))
 
 
+def test_a_first_observation_that_is_not_finite_stops_the_run():
+    with pytest.raises(ValueError, match="step 0 of 'Toy-v0'.*nan"):
+        toy_run(task_options=dict(bad_step=0, bad_obs=math.nan))
+
+
+def test_a_run_that_broke_off_says_so_and_goes_on_from_its_file(tmp_path, monkeypatch):
+    def interrupt(env):
+        if len(env.actions) == 25:
+            raise KeyboardInterrupt
+
+    config = Config(toys.TASK, **SMALL, steps=40, warmup=5,
+                    task_options=dict(ends_after=10))
+    undisturbed = list(Training(config))
+    monkeypatch.setattr(toys.Toy, "on_step", interrupt)
+    training = Training(config)
+    with pytest.raises(KeyboardInterrupt):
+        list(training)
+    with pytest.raises(RuntimeError, match="broke off at step 25"):
+        list(training)  # a notebook's cell, run again
+    training.save(tmp_path / "run.npz")
+    monkeypatch.undo()
+    rest = list(Training.load(tmp_path / "run.npz"))
+    assert rest[-1].step == 40
+    np.testing.assert_equal(rest[-1], undisturbed[-1])
+
+
+@pytest.mark.parametrize("name, value", [
+    ("state", lambda self: 3), ("state", {"x": 1}), ("state", (1, (2, 3))),
+    ("model", "a net")])
+def test_a_foreign_task_may_use_our_names(name, value, monkeypatch):
+    monkeypatch.setattr(toys.Toy, name, value, raising=False)
+    monkeypatch.setattr(toys.Toy, "data", {}, raising=False)
+    training, _ = toy_run(steps=200)
+    assert training.kept[0]["state"].shape == (0,)
+
+
 def test_training_refuses_a_task_that_does_not_fit():
     with pytest.raises(ValueError, match="CartPole-v1.*Discrete"):
         Training(Config("CartPole-v1"))
 
 
-def test_one_thread_inside_and_the_callers_number_outside():
+def test_one_thread_inside_and_the_callers_number_outside(monkeypatch):
     seen = []
 
     def look(_):
         seen.append({pool["num_threads"] for pool in threadpoolctl.threadpool_info()
                      if pool["user_api"] == "blas"})
 
+    monkeypatch.setattr(toys.Toy, "on_step", look)
     with threadpoolctl.threadpool_limits(2, user_api="blas"):
-        for _ in Training(Config(toys.TASK, **SMALL, steps=12, warmup=5, yield_every=4,
-                                 task_options={"on_step": look})):
+        for _ in Training(Config(toys.TASK, **SMALL, steps=12, warmup=5,
+                                 yield_every=4)):
             outside = {pool["num_threads"] for pool in threadpoolctl.threadpool_info()
                        if pool["user_api"] == "blas"}
             assert outside == {2}
