@@ -6,7 +6,6 @@ and a wrong one to none.
 
 import numpy as np
 import pytest
-import torch
 
 from dnddpg_minimal import (
     Batch,
@@ -19,6 +18,7 @@ from dnddpg_minimal import (
 )
 from dnddpg_minimal.dnddpg import backward, cut, forward, join
 
+torch = pytest.importorskip("torch")
 torch.set_num_threads(1)  # for networks this small, more threads only wait
 
 OBS, ACTION, SIZES = 3, 2, (5, 6, 4, 2)  # the networks' input is obs, action

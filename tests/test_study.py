@@ -678,12 +678,17 @@ def test_a_claim_needs_an_interval_on_one_side_of_zero():
         names=records.RUN)
     noise = np.array([-1, 1, 0, 2, -2.0])
     runs = pd.DataFrame({"return": np.concatenate([noise, noise - 10, noise[::-1]]),
-                         "bias": np.concatenate([noise - 9, noise - 5, noise])}, index)
+                         "bias": np.concatenate([noise - 9, noise - 5, noise]),
+                         "owed": 0.0}, index)
     verdicts = {one["claim"]: one["verdict"] for one in records.claims(runs)}
     assert verdicts == {
         "return: DN > DDPG": "not distinguishable", "return: DN > DCN": "holds",
         "bias: DDPG > 0": "does not hold", "bias: DCN < 0": "holds",
         "bias: DN > DCN": "holds"}
+    runs["owed"] = np.repeat([-9.0, -5.0, 0.0], 5)  # all of it is lag
+    verdicts = {one["claim"]: one["verdict"] for one in records.claims(runs)}
+    assert verdicts["bias: DCN < 0"] == "holds, and is no more than what is owed to lag"
+    assert verdicts["return: DN > DCN"] == "holds"
 
 
 # --- ablations and bugs ---------------------------------------------------------------
