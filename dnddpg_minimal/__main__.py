@@ -50,7 +50,8 @@ def train(
     """Train one agent and save the run.
 
     A default of None means: from the task's preset, or no limit. Ctrl-C finishes the
-    episode, saves, and says how to go on; a second Ctrl-C leaves at once.
+    episode, saves, and says how to go on; a second Ctrl-C leaves at once. A file that
+    exists is refused, and so is --resume with other options.
 
     Args:
         config: every choice of the run.
@@ -89,7 +90,7 @@ def try_out(config):
 
 
 def run(training, out):
-    """Train to the end, or to Ctrl-C. Saves to `out`, says how to go on → exit code."""
+    """Go on with a training to its end, or to Ctrl-C; save it to `out` → exit code."""
     go_on = command("train --resume", out)
     saved_at = time.monotonic()
     scale = dict(total=training.config.steps, initial=training.step, unit=" steps")
@@ -154,7 +155,8 @@ def watch(
 ) -> int:
     """Show a saved agent at work, in a window or as a film, and print its return.
 
-    The agent acts without exploration noise.
+    The agent acts without exploration noise. Fewer than one episode, or a seed below 0,
+    is refused.
 
     Args:
         file: what `train` saved, or an agent's own file.
@@ -187,7 +189,9 @@ def watch(
 
 
 def show(agent, env, start):
-    """Play one episode and print its return → its number of steps.
+    """Play one episode of an agent in env and print its return → its number of steps.
+
+    start: the seed of its start.
 
     A window that its user closes ends the command, as Ctrl-C does.
     """
@@ -265,7 +269,10 @@ def task_options_registry():
 
 
 def task_options(words):
-    """["goal_area=window", "success_terminates=true"] → a dict; values as in JSON."""
+    """Words such as "goal_area=window" → a dict; values as in JSON, else text.
+
+    ValueError for a word that is not NAME=VALUE.
+    """
     options = {}
     for word in words:
         name, equals, value = word.partition("=")
@@ -279,13 +286,16 @@ def task_options(words):
 
 
 def command(words, path):
-    """The command line that runs `words` on a file, as one would type it here."""
+    """The command line that runs `words` on the file `path`, as one would type it."""
     line = [sys.orig_argv[0], "-m", "dnddpg_minimal", *words.split(), str(path)]
     return subprocess.list2cmdline(line) if os.name == "nt" else shlex.join(line)
 
 
 def check_can_write(path, suffix=None):
-    """ValueError if the file can't be written: better now than after the run."""
+    """ValueError if `path` can't be written, or has another suffix.
+
+    Better now than after the run.
+    """
     folder = path.parent
     if not folder.is_dir():
         raise ValueError(f"{path}: there is no folder {folder}")
@@ -296,7 +306,7 @@ def check_can_write(path, suffix=None):
 
 
 def in_words(error):
-    """An exception as one line."""
+    """An error, an exception, as one line."""
     if isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {error.strerror}"
     return " ".join(str(error).split())

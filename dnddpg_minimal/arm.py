@@ -87,7 +87,10 @@ def start_states(rng, n, goal="easy", goal_area="reachable"):
 
 
 def locate(joints):
-    """Elbow and finger in px from the base: (N, 2) radians -> (N, 2 points, xy)."""
+    """Elbow and finger in px from the base: joints (N, 2) -> (N, 2 points, xy).
+
+    The joints are angles in radians, joint 2 against link 1.
+    """
     angles = np.add.accumulate(joints, axis=1)  # of link 1, link 2 against the x axis
     points = np.empty((len(joints), 2, 2))
     np.cos(angles, out=points[:, :, 0])
@@ -98,7 +101,7 @@ def locate(joints):
 
 
 def observe(states):
-    """What the agent sees, (N, 5) -> (N, 9) float32, all within [-1, 1].
+    """What the agent sees: states (N, 5) -> (N, 9) float32, all within [-1, 1].
 
     Columns: elbow / 200 and finger / 200, seen from the base (x, y each);
     (goal - elbow) / 400 and (goal - finger) / 400 (x, y each); 1 on goal, else 0.
@@ -120,7 +123,8 @@ def step(states, actions, reward="distance"):
     Returns next_states (N, 5), rewards (N,), success (N,) bool. The states given are
     not changed. Nothing ends here: a counter beyond 50 counts on, and success stays
     True while the finger stays. What success means for an episode is for `Arm` to say.
-    Joints come back in [0, 2 pi] (2 pi itself only by rounding).
+    Joints come back in [0, 2 pi] (2 pi itself only by rounding). ValueError for another
+    reward.
     """
     next_states = np.array(states, np.float64)
     turn = np.minimum(np.maximum(np.asarray(actions, np.float64), -1.0), 1.0)
@@ -197,7 +201,7 @@ def reference_action(states):
 
 
 def reference_steps(states):
-    """Steps until `reference_action` is on goal for the first time, (N, 5) -> (N,).
+    """Steps until `reference_action` is on goal first: states (N, 5) -> (N,).
 
     0 where the finger is on the goal already; inf where the goal is out of reach.
     At most 32: no joint is more than pi away, and it turns 0.1 rad in a step.
@@ -307,7 +311,11 @@ class Arm(gym.Env):
 
     @property
     def state(self):
-        """(joint 1, joint 2, goal x, goal y, counter): radians, px, steps. Settable."""
+        """(joint 1, joint 2, goal x, goal y, counter): radians, px, steps.
+
+        (5,) float64; it can be set. ValueError for anything but five finite numbers,
+        for a goal outside the window, and for a negative counter.
+        """
         self._check_started()
         return self._states[0].copy()
 
@@ -327,6 +335,10 @@ class Arm(gym.Env):
         self._states = value[None]
 
     def reset(self, *, seed=None, options=None):
+        """Begin an episode → obs (9,), and info with "success" and "on_goal".
+
+        `seed` as in Gymnasium; there are no `options`.
+        """
         super().reset(seed=seed)
         self._states = start_states(self.np_random, 1, self.goal, self.goal_area)
         obs = observe(self._states)[0]
@@ -335,6 +347,10 @@ class Arm(gym.Env):
         return obs, {"success": False, "on_goal": bool(obs[8])}
 
     def step(self, action):
+        """One turn of both joints, action (2,) in [-1, 1]; larger ones are clipped.
+
+        Returns obs (9,), reward, terminated, truncated, info, as in Gymnasium.
+        """
         self._check_started()
         actions = np.asarray(action, np.float64).reshape(1, 2)
         self._states, rewards, success = step(self._states, actions, self.reward)
@@ -372,6 +388,7 @@ class Arm(gym.Env):
         return None
 
     def close(self):
+        """Close the window, if there is one."""
         if self._screen is not None:
             pygame = _import_pygame()
             pygame.display.quit()

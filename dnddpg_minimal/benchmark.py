@@ -50,7 +50,7 @@ PEER = "stable-baselines3"
 
 
 def our_run(config, steps):
-    """A Training, past its warm-up, as a function that goes on for `steps` steps."""
+    """A Training of config, past its warm-up, as a function: `steps` steps more."""
     training = Training(config)
 
     def go_on():
@@ -65,7 +65,10 @@ def our_run(config, steps):
 
 
 def peer_run(config, steps):
-    """The same work by stable-baselines3's DDPG, as a function like `our_run`'s."""
+    """The same work (config, steps) by stable-baselines3's DDPG, as `our_run` gives it.
+
+    ImportError where that package is not installed.
+    """
     from stable_baselines3 import DDPG
     from stable_baselines3.common.noise import NormalActionNoise
 
@@ -86,7 +89,11 @@ def peer_run(config, steps):
 
 
 def contestants(task, hidden, batch_size, steps, warmup):
-    """Who takes turns on one task: {(algorithm, program): function that starts it}."""
+    """Who takes turns on one task: {(algorithm, program): function that starts it}.
+
+    hidden and batch_size are everybody's; `warmup` steps come first, then turns of
+    `steps` steps.
+    """
     def config(algorithm, backend):
         return Config(task, algorithm, hidden=hidden, batch_size=batch_size,
                       backend=backend, noise="gaussian", sigma=0.1, warmup=warmup,
@@ -104,7 +111,10 @@ def contestants(task, hidden, batch_size, steps, warmup):
 
 
 def steps_a_second(size, rounds, warmup=WARMUP):
-    """Rows of the table for one task: everybody in turn, `rounds` times."""
+    """Rows of the table for one task: everybody in turn, `rounds` times.
+
+    size: a row of SIZES; warmup: steps before the clock runs.
+    """
     task, hidden, batch_size, steps = size
     runs, missing = {}, {}
     for name, start in contestants(*size, warmup).items():
@@ -151,7 +161,7 @@ def watched(array):
 
 
 def change_arrays(agent, view):
-    """Replace every array that an agent holds by `view` of it: the same memory."""
+    """Replace every array of an agent by view(array): the same memory, in place."""
     def change(value):
         if isinstance(value, np.ndarray):
             return view(value)
@@ -166,7 +176,7 @@ def change_arrays(agent, view):
 
 
 def products_of(agent, batch):
-    """The matrix products in one update, as the arguments of `np.matmul`.
+    """The matrix products in one update on a batch, as the arguments of `np.matmul`.
 
     They are the agent's own arrays: shapes, strides and buffers are those of a real
     update. Where an update lets NumPy make the result's memory, `out` is None.
@@ -180,7 +190,10 @@ def products_of(agent, batch):
 
 
 def update_beside_products(algorithm, rounds, updates):
-    """One row: an update at Table 1's size, beside nothing but its products."""
+    """One row: an update of an algorithm at Table 1's size, beside its bare products.
+
+    The two take turns, `rounds` times; a turn is so many `updates`.
+    """
     config = Config.paper("HalfCheetah-v5", algorithm)
     env = make_env(config)
     (obs_dim,), (action_dim,) = env.observation_space.shape, env.action_space.shape
@@ -207,7 +220,10 @@ def update_beside_products(algorithm, rounds, updates):
 
 
 def random_batch(size, obs_dim, action_dim):
-    """A Batch of `size` random transitions, float32, the same at each call."""
+    """A Batch of B = `size` random transitions, float32, the same at each call.
+
+    obs_dim is O, action_dim is A; actions lie in [-1, 1].
+    """
     rng = np.random.default_rng(0)
     batch = Batch(rng.normal(size=(size, obs_dim)),
                   rng.uniform(-1, 1, (size, action_dim)), rng.normal(size=size),
@@ -250,7 +266,10 @@ print(peak())
 
 
 def peak_memory(stored, steps):
-    """Rows: the most memory that a Humanoid run held, without and with a checkpoint."""
+    """Rows: the most memory that a Humanoid run held, without and with a checkpoint.
+
+    stored: transitions in replay; steps: with an update each, at the least.
+    """
     what = "peak memory, MB", f"Humanoid-v5, {stored:,} transitions in replay"
     who = "DN-DDPG", "NumpyAgent"
     if sys.platform not in ("linux", "darwin"):
@@ -268,7 +287,11 @@ def peak_memory(stored, steps):
 
 
 def alternate(runs, rounds):
-    """Let everybody have one turn in each round: the seconds of each turn, by name."""
+    """Let everybody have one turn in each of so many `rounds`.
+
+    runs: a dict from a name to a function. Returns the same names to the seconds of
+    each turn, (rounds,).
+    """
     seconds = {name: [] for name in runs}
     for _ in range(rounds):
         for name, run in runs.items():
@@ -279,17 +302,17 @@ def alternate(runs, rounds):
 
 
 def median(values):
-    """The median of a list of numbers."""
+    """The median of a list of values."""
     return statistics.median(values)
 
 
 def spread(values, form):
-    """The lowest and the highest, each written by the format `form`."""
+    """The lowest and the highest of values, each written by the format `form`."""
     return f"{form.format(min(values))} to {form.format(max(values))}"
 
 
 def shape(hidden):
-    """Widths as text: (64, 64) is 64-64."""
+    """The widths of hidden layers as text: (64, 64) is 64-64."""
     return "-".join(map(str, hidden))
 
 
@@ -339,6 +362,7 @@ def command(rounds: int = 7, quick: bool = False) -> int:
     """Measure the speed and print a table. About ten minutes on a free machine.
 
     Nothing else should run meanwhile: the medians forgive a disturbance, not a load.
+    Fewer than one round is refused.
 
     Args:
         rounds: how many turns everybody has; the table shows the median.

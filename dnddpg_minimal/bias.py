@@ -71,7 +71,7 @@ PORTION = 420  # states in one rollout of `true_q`: what the processor's cache h
 
 
 class Dynamics:
-    """The exact equations of one task, for N states in lock-step.
+    """The exact equations of the config's task, for N states in lock-step.
 
     `reset(rng, n) -> states (N, S)`: starts, drawn by the task itself from n seeds.
     `observe(states) -> obs (N, O)` float32.
@@ -93,7 +93,7 @@ class Dynamics:
         self.rng = np.random.default_rng(0)  # for a task with chance in its steps
 
     def reset(self, rng, n):
-        """States (n, S) at the start of n episodes, as the task itself draws them."""
+        """n starts (n, S), as the task itself draws them from n seeds of rng."""
         self.rng, starts = rng, []
         for seed in rng.integers(2**31, size=n):
             self.env.reset(seed=int(seed))
@@ -109,7 +109,7 @@ class Dynamics:
         raise NotImplementedError
 
     def on_goal(self, states):
-        """Steps in a row on the goal: (N,). Only the Arms count them."""
+        """Steps in a row on the goal, states (N, S) → (N,): only the Arms count."""
         return np.zeros(len(states))
 
 
@@ -252,7 +252,7 @@ VECTORISED = {
 
 
 def dynamics(config):
-    """The task's equations for many states, or None where there are none."""
+    """The equations of the config's task for many states, or None without equations."""
     return VECTORISED[config.task](config) if config.task in VECTORISED else None
 
 
@@ -262,7 +262,7 @@ def dynamics(config):
 
 
 def greedy(agent, rule=None):
-    """The policy that is measured: obs (B, O) -> action (B, A), without noise.
+    """The agent's policy that is measured: obs (B, O) -> action (B, A), no noise.
 
     `rule` names how one of the K actors is chosen (Eq. (12)); None: `act_rule`.
     """
@@ -281,8 +281,8 @@ def rollout(world, states, policy, gamma, steps=None, first_action=None):
     """Follow a policy from N states, all in lock-step.
 
     states (N, S); policy obs (B, O) -> action (B, A) in [-1, 1]; first_action (N, A)
-    is done first if it is given. A row whose world has ended earns nothing more.
-    One rollout serves two quantities; a dict of arrays (N,):
+    is done first if it is given. gamma is the discount of one step. A row whose world
+    has ended earns nothing more. One rollout serves two quantities; a dict of (N,):
         truth     discounted sum of up to `steps` rewards; time limits are passed over
         returns   plain sum of the first `world.limit` rewards; on Arm up to success
         ended     did the world really end?
@@ -330,12 +330,15 @@ def rollout(world, states, policy, gamma, steps=None, first_action=None):
 
 
 def largest_tail(gamma, steps, largest):
-    """The most that rewards up to `largest` can add after `steps` steps."""
+    """The most that rewards up to `largest` can add after `steps` steps, with gamma."""
     return gamma**steps * largest / (1 - gamma) if gamma < 1 else np.inf
 
 
 def true_q(world, states, action, agent, rule=None):
-    """Q^pi(s, a) of N states (N, S) and actions (N, A) in [-1, 1]: (N,)."""
+    """Q^pi(s, a) of N states (N, S) and actions (N, A) in [-1, 1]: (N,).
+
+    world: of `dynamics`; agent, rule: as in `greedy`.
+    """
     policy, gamma = greedy(agent, rule), agent.config.gamma
     truth = []
     for start in range(0, len(states), PORTION):
@@ -346,7 +349,7 @@ def true_q(world, states, action, agent, rule=None):
 
 
 def walk(env, policy, seed, steps):
-    """One episode, at most `steps` steps.
+    """One episode of a policy in env from the start `seed`, at most `steps` steps.
 
     Returns obs (T, O), action (T, A) in [-1, 1], reward (T,), terminated.
     """
@@ -364,7 +367,7 @@ def walk(env, policy, seed, steps):
 
 
 def discounted(rewards, gamma):
-    """The discounted sum of what follows each step: (T,) -> (T,)."""
+    """The discounted sum of what follows each step: rewards (T,), gamma -> (T,)."""
     sums, following = np.zeros(len(rewards)), 0.0
     for t in reversed(range(len(rewards))):
         following = rewards[t] + gamma * following
@@ -405,12 +408,15 @@ def summary(values):
 
 
 def with_min(q):
-    """Each critic, and their min: (C, B) -> (C + 1, B)."""
+    """Each critic, and their min: q (C, B) -> (C + 1, B)."""
     return np.concatenate([q, q.min(axis=0, keepdims=True)])
 
 
 def bias_rows(labels, q, truth):
-    """One row for each critic and for the min: q (C + 1, n), truth (n,)."""
+    """One row for each critic and for the min: q (C + 1, n), truth (n,).
+
+    A row is a dict: labels, and what `Measurement.bias` holds besides.
+    """
     names = [str(c) for c in range(len(q) - 1)] + ["min"]
     rows = []
     for name, estimate in zip(names, q, strict=True):
@@ -498,6 +504,8 @@ def _reaches_a_quarter(config, step):
 
 def _by_equations(agent, common, rng, kept, full, world):
     """100 fresh starts and the last 60 kept states. Standard errors are over states.
+
+    One state is kept from each 156 steps, so the 60 span the last 9 360.
 
     One rollout holds, side by side: both kinds of states with the policy's own action,
     the kept states with the replayed action, and, if `full`, the kept states with each
@@ -623,7 +631,7 @@ def _truth_of_kept(agent, kept, actions):
 
 
 def plane(agent, world, x=0, y=1, fixed=None, size=41):
-    """Q and truth over two state variables, for a picture of the error.
+    """An agent's Q, and the truth, over two state variables of a world.
 
     x, y: indices or names of state variables (`world.names`); the others stay at
     `fixed` (S,), by default `world.rest`. Returns a dict: x (size,), y (size,),
@@ -656,7 +664,7 @@ def plane(agent, world, x=0, y=1, fixed=None, size=41):
 
 
 def owed(updates, values, config):
-    """The bias that a critic has only because it lags: (M,).
+    """The bias that a critic has only because it lags: (M,), with the config's τ and γ.
 
     A part of Q that is constant over the states follows
         dQ/dn = tau (1 - gamma) (V(n) - Q),   Q(0) = 0,
@@ -798,8 +806,9 @@ def predict(sigma, kappa, rho, rule, nu=0.1):
     """The bias delta that `target_rule` makes in each new target, in closed form.
 
     sigma, kappa, rho as measured (`Measurement.operator`); NaN for kappa means one
-    critic, for rho one actor. At most two critics and two actors. The operator alone:
-    errors of mean 0. Units of sigma.
+    critic, for rho one actor. At most two critics and two actors. nu is the weight ν
+    of `soft`. The operator alone: errors of mean 0. Units of sigma. ValueError for an
+    unknown rule.
     """
     kappa, rho = (1.0 if np.isnan(c) else c for c in (kappa, rho))
     forms = {

@@ -33,7 +33,7 @@ WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
 def run_chapter(path):
-    """Run a notebook in a kernel of its own → the notebook, with its outputs.
+    """Run the notebook at `path` in a kernel of its own → it, with its outputs.
 
     Nothing is written. Cells keep their times in `metadata.execution`. ValueError
     where a cell fails: the chapter, and what the cell said.
@@ -64,7 +64,10 @@ def tidy(notebook):
 
 
 def write_chapter(notebook, path):
-    """Write a notebook as JupyterLab does: keys in order, one space, a last newline."""
+    """Write a notebook to `path` as JupyterLab does: keys in order, one space, newline.
+
+    The file is written under another name, and takes its own name when complete.
+    """
     import nbformat
 
     part = Path(f"{path}.part")
@@ -101,7 +104,7 @@ def save_last_figure(path):
 
 
 def measured(path):
-    """Run a chapter → (the notebook, a dict: seconds in all, to its first picture; kB).
+    """Run the chapter at `path` → (notebook, a dict: seconds, to first picture; kB).
 
     Seconds count from the start of its kernel. "largest PNG" is of its outputs.
     """
@@ -120,7 +123,10 @@ def measured(path):
 
 
 def import_seconds(rounds=5):
-    """Median seconds to import this package, beyond Gymnasium's own, without torch."""
+    """Seconds to import this package, beyond Gymnasium's own, without torch.
+
+    The median of `rounds` fresh processes.
+    """
     code = ("import sys, time, gymnasium; start = time.perf_counter();"
             "import dnddpg_minimal; print(time.perf_counter() - start);"
             "assert 'torch' not in sys.modules")

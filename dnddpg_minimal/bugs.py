@@ -60,7 +60,10 @@ class EnvUnits(Training):
 
 
 class _OtherAgent(Training):
-    """A Training with another class of agent: `agent_class`."""
+    """A Training with another class of agent, `agent_class`: DDPG in NumPy only.
+
+    Another config is refused with a ValueError.
+    """
 
     agent_class = NumpyAgent
 
@@ -81,17 +84,21 @@ class LostAxisAgent(NumpyAgent):
     """
 
     def td_target(self, batch):
+        """The mean of y over the batch, B times, (B,): what each q is drawn to."""
         y = super().td_target(batch)
         self.variance = y.var()
         return np.full_like(y, y.mean())
 
     def update(self, batch, climb=True):
+        """As `Agent.update`; the critic's loss is larger by the variance of y."""
         losses = super().update(batch, climb)
         losses["critic"] = losses["critic"] + self.variance
         return losses
 
 
 class LostAxis(_OtherAgent):
+    """Trains `LostAxisAgent`. ValueError for anything but DDPG in NumPy."""
+
     agent_class = LostAxisAgent
 
 
@@ -104,6 +111,7 @@ class ThroughYAgent(NumpyAgent):
     """
 
     def td_target(self, batch):
+        """y (B,) of a batch from the networks that learn, not from slow copies."""
         self.batch = batch
         q_next = self._q(batch.next_obs, self._act(batch.next_obs))  # (1, 1, B)
         return td_target(batch.reward, batch.terminated, q_next, self.config.gamma)
@@ -114,7 +122,7 @@ class ThroughYAgent(NumpyAgent):
         super()._adam(part, lr)
 
     def gradient_through_y(self):
-        """The part that should not be there, as a flat vector like theta."""
+        """The part that should not be there: a flat vector (weights,), like theta."""
         batch, extra = self.batch, np.zeros_like(self.theta)
         y = self.td_target(batch)
         error = self._q(batch.obs, batch.action[None])[0, 0] - y  # (B,)
@@ -126,6 +134,8 @@ class ThroughYAgent(NumpyAgent):
 
 
 class ThroughY(_OtherAgent):
+    """Trains `ThroughYAgent`. ValueError for anything but DDPG in NumPy."""
+
     agent_class = ThroughYAgent
 
 

@@ -32,6 +32,8 @@ def command(notebook: Annotated[Path, tyro.conf.Positional], seconds: int = 60,
             total: int = 300) -> int:
     """Run an exercise notebook afresh; print its points, and what is wrong.
 
+    A time limit below 1 is refused, and a file that is no exercise.
+
     Args:
         notebook: the notebook to check; it is not changed.
         seconds: time limit of one cell. A cell that takes longer is left out.
@@ -59,7 +61,7 @@ def command(notebook: Annotated[Path, tyro.conf.Positional], seconds: int = 60,
 
 
 def read(path):
-    """The notebook in a file. OSError if there is none, ValueError if it is broken."""
+    """The notebook at path. OSError if there is none, ValueError if it is broken."""
     import nbformat
 
     try:
@@ -87,19 +89,20 @@ def id_of(cell):
 
 
 def is_locked(cell):
-    """A check or given code: students do not write there."""
+    """Is this cell a check or given code? Students do not write there."""
     return id_of(cell) is not None and not cell.metadata.nbgrader.get("solution")
 
 
 def is_check(cell):
-    """Is this a check, a locked cell that gives points?"""
+    """Is this cell a check, a locked one that gives points?"""
     return is_locked(cell) and bool(cell.metadata.nbgrader.get("grade"))
 
 
 def source_of(nb, path):
     """The notebook that the checks come from, and a phrase about it.
 
-    Raises ValueError if there is no exercise in `nb`.
+    path: where `nb` lies; its name tells the chapter where no cell does. Raises
+    ValueError if there is no exercise in `nb`.
     """
     numbers = [number_of(id_of(cell)) for cell in nb.cells if id_of(cell)]
     chapter = int(numbers[0].split(".")[0]) if numbers else None
@@ -116,7 +119,7 @@ def source_of(nb, path):
 
 
 def with_checks_of(source, nb):
-    """The code cells to run: the student's, with checks and given code of `source`.
+    """The code cells to run: those of `nb`, with checks and given code of `source`.
 
     Returns them and the ids of checks that are the student's own and were changed.
     """
@@ -157,9 +160,10 @@ def was_changed(cell):
 def run(cells, folder, seconds, total):
     """Run code cells in a fresh kernel → {index: (kind of error, its text)}.
 
-    A cell that takes too long, or ends the kernel, is left out and the rest is run
-    again without it, as long as there is time. What a cell did before is known, and
-    counts where there is no time to run it again.
+    folder: where the kernel works. A cell may take so many `seconds`, all of them
+    together `total`. A cell that takes too long, or ends the kernel, is left out and
+    the rest is run again without it, as long as there is time. What a cell did before
+    is known, and counts where there is no time to run it again.
     """
     from nbclient.exceptions import CellTimeoutError, DeadKernelError
 
@@ -198,7 +202,7 @@ def run(cells, folder, seconds, total):
 
 
 def fresh_client(cells, folder):
-    """An nbclient whose kernel is this Python, whatever else is installed."""
+    """An nbclient for these cells, at work in a folder, whose kernel is this Python."""
     from ipykernel.kernelspec import get_kernel_dict
     from jupyter_client.kernelspec import KernelSpec, KernelSpecManager
     from nbclient import NotebookClient
@@ -219,7 +223,11 @@ def fresh_client(cells, folder):
 
 
 def exercises(cells, errors, changed=()):
-    """{number: (points, possible points, sentences about what is wrong)}."""
+    """{number: (points, possible points, sentences about what is wrong)}.
+
+    errors: as `run` returns them for these cells; changed: ids of checks that are not
+    what they were, and give no points.
+    """
     results = {}
     for index, cell in enumerate(cells):
         if not is_check(cell):
@@ -238,7 +246,10 @@ def exercises(cells, errors, changed=()):
 
 
 def stopped(cells, errors, number, index):
-    """Why a check did not pass: errors in the exercise's other cells, then its own."""
+    """Why a check did not pass: errors in the exercise's other cells, then its own.
+
+    The check is cells[index], of the exercise with this number; errors as in `run`.
+    """
     for other in range(index):
         if other in errors and number_of(id_of(cells[other])) == number \
                 and not is_check(cells[other]):
@@ -247,7 +258,7 @@ def stopped(cells, errors, number, index):
 
 
 def in_words(name, text):
-    """An error as one line: an AssertionError is a sentence by itself."""
+    """An error, its name and its text, as one line. An AssertionError is a sentence."""
     text = " ".join(text.split())
     if name == "NotImplementedError":
         return "not done yet: a raise NotImplementedError is left"

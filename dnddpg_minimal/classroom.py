@@ -56,7 +56,8 @@ def close(value, expected, name, atol=1e-6, rtol=0.0, mistakes=None):
 
     value: what the student's code returned, which comes back as an array, also where it
     is a list; expected: an array or a number. `name` stands at the beginning of the
-    sentence. Shapes must be equal, nothing is broadcast.
+    sentence. Shapes must be equal, nothing is broadcast; a number may be off by atol
+    + rtol · |expected|.
     mistakes: {sentence: what one gets by this mistake}; the sentence is added where
     the value is that of the mistake.
     """
@@ -98,7 +99,10 @@ def _difference(value, expected, name):
 
 
 def number_of(grade_id):
-    """"exercise-1-2", "check-1-2b", "given-1-2" → "1.2"; None for any other name."""
+    """A cell's grade_id → its exercise's number, or None for any other name.
+
+    "exercise-1-2", "check-1-2b", "given-1-2" → "1.2".
+    """
     found = re.fullmatch(r"(?:exercise|check|given)-(\d+)-(\d+)[a-z]?", str(grade_id))
     return f"{int(found[1])}.{found[2]}" if found else None
 
@@ -167,7 +171,8 @@ def generate(solutions=ROOT / "solutions", exercises=ROOT / "exercises"):
 def course(folder, solutions=ROOT / "solutions"):
     """Make a course folder: nbgrader's configuration, and an assignment a chapter.
 
-    Raises FileExistsError if the folder holds a course already.
+    `solutions` is the folder that they come from. Raises FileExistsError if `folder`
+    holds a course already.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "nbgrader_config.py", "x", encoding="utf-8") as file:

@@ -232,6 +232,7 @@ class Config:
 
         The small tasks take the `class` numbers with those episodes and limits, since
         Table 1 speaks of MuJoCo only. Rows 1 and 10 have no clear meaning: left out.
+        task, algorithm and seed are the fields of Config.
         """
         table_1 = dict(actor_lr=1e-4, critic_lr=1e-4, hidden=(400, 300), batch_size=256,
                        tau=0.01, gamma=0.99, target_every=10, episodes=5_000)
@@ -245,7 +246,7 @@ class Config:
 
     @classmethod
     def from_json(cls, text):
-        """The Config that `to_json` wrote. TypeError if it holds unknown fields."""
+        """The Config in a text of `to_json`. TypeError if it holds unknown fields."""
         return cls(**json.loads(text))
 
 
@@ -319,7 +320,10 @@ class Batch(NamedTuple):
 
 
 class ReplayBuffer:
-    """The last `capacity` transitions, in float32. A batch is drawn uniformly."""
+    """The last `capacity` transitions, in float32. A batch is drawn uniformly, by rng.
+
+    obs_dim is O, action_dim is A.
+    """
 
     def __init__(self, capacity, obs_dim, action_dim, rng):
         self.capacity, self.rng = capacity, rng
@@ -329,7 +333,10 @@ class ReplayBuffer:
         self.position = 0  # row that the next transition is written to
 
     def add(self, obs, action, reward, next_obs, terminated):
-        """Store one transition; the oldest makes room when the buffer is full."""
+        """Store one transition; the oldest makes room when the buffer is full.
+
+        obs and next_obs (O,), action (A,) in [-1, 1]; reward, terminated: one number.
+        """
         transition = (obs, action, reward, next_obs, terminated)
         for array, value in zip(self.arrays, transition, strict=True):
             array[self.position] = value
@@ -337,7 +344,10 @@ class ReplayBuffer:
         self.position = (self.position + 1) % self.capacity
 
     def sample(self, batch_size) -> Batch:
-        """Draw `batch_size` transitions, uniformly and with replacement."""
+        """Draw `batch_size` transitions, uniformly and with replacement.
+
+        Raises ValueError if nothing was stored yet.
+        """
         if self.size == 0:
             raise ValueError("sample() from an empty ReplayBuffer: add() first.")
         rows = self.rng.integers(self.size, size=batch_size)
@@ -347,7 +357,8 @@ class ReplayBuffer:
 class Noise:
     """Exploration noise: Ornstein-Uhlenbeck (dt = 1), x ← x - θx + σ·N(0, 1).
 
-    With θ = 1 nothing is left of the old x: that is Gaussian noise.
+    With θ = 1 nothing is left of the old x: that is Gaussian noise. The config says
+    which, and gives σ and θ; action_dim is A; rng draws.
     """
 
     def __init__(self, config, action_dim, rng):
@@ -373,7 +384,10 @@ class Noise:
 
 
 def cut(flat, count, sizes):
-    """Cut one flat vector into the layers of N networks: views (N, in + 1, out)."""
+    """Cut one flat vector into the layers of N networks: views (N, in + 1, out).
+
+    count is N; sizes are the widths from the input to the output.
+    """
     layers, start = [], 0
     for n_in, n_out in pairwise(sizes):
         stop = start + count * (n_in + 1) * n_out
@@ -455,7 +469,8 @@ def adam(theta, dtheta, m, v, t, lr, beta1=0.9, beta2=0.999, eps=1e-8):
     """Step t = 1, 2, ... of Adam on a flat vector, in place (Kingma and Ba 2015).
 
     theta, its gradient dtheta, and the moments m and v are (P,). As PyTorch's: moments
-    are bias-corrected, eps stands outside the square root. Overwrites dtheta.
+    are bias-corrected, eps stands outside the square root. lr is the learning rate;
+    beta1 and beta2, how much of the moments stays. Overwrites dtheta.
     """
     correction = math.sqrt(1 - beta2**t)
     m *= beta1
@@ -561,7 +576,8 @@ class Agent:
         update(batch)          dict          losses "critic" (C,) and "actor" (K,)
 
     Observations are (B, O), actions (B, A) in [-1, 1]; NumPy arrays in and out.
-    `slow=True` asks the slow copies instead of the networks that learn.
+    `slow=True` asks the slow copies instead of the networks that learn. obs_dim is O,
+    action_dim is A: the widths that the networks get.
 
     Each agent adds the two halves of an update, `fit_critics` and `climb_critics`, and
     what they need: `_array` and `_numpy` turn NumPy's arrays into its own and back,
@@ -587,7 +603,7 @@ class Agent:
                              adam_v=zeros, updates=0))
 
     def cut(self, theta):
-        """Views into one flat vector: (the critics' layers, the actors' layers)."""
+        """Views into a flat vector theta (size,): (critics' layers, actors' layers)."""
         return (cut(theta[:self.split], self.config.critics, self.critic_sizes),
                 cut(theta[self.split:], self.config.actors, self.actor_sizes))
 
@@ -609,7 +625,7 @@ class Agent:
         self._prepare()
 
     def act(self, obs):
-        """The greedy action, without noise: (O,) → (A,) or (B, O) → (B, A)."""
+        """The greedy action at obs, without noise: (O,) → (A,) or (B, O) → (B, A)."""
         batch = self._rows(obs, self.obs_dim, "obs")
         actions = self._act(batch)  # (K, B, A)
         action = actions[0]
@@ -679,15 +695,16 @@ class Agent:
         return losses
 
     def save(self, path):
-        """Write weights, slow copies and Adam's moments to one `.npz`."""
+        """Write weights, slow copies and Adam's moments to one `.npz` at `path`."""
         write_npz(path, config=self.config.to_json(), obs_dim=self.obs_dim,
                   action_dim=self.action_dim, **self.arrays())
 
     @classmethod
     def load(cls, path):
-        """The agent in a file that either agent's `save` (or a Training's) wrote.
+        """The agent in the file at `path`, by the `save` of an agent or a Training.
 
         `NumpyAgent.load` makes a NumPy agent of it, `TorchAgent.load` a PyTorch agent.
+        Raises ValueError if the file holds no agent, or one of another version.
         """
         content = read_npz(path)
         try:
@@ -887,12 +904,12 @@ def make_env(config, render_mode=None):
 
 
 def is_mujoco(env):
-    """True if the task runs in MuJoCo."""
+    """True if env, a Gymnasium environment, runs in MuJoCo."""
     return type(getattr(env.unwrapped, "model", None)).__module__.startswith("mujoco")
 
 
 def simulator_state(env):
-    """The task's whole state as arrays: (state (S,), MuJoCo's xipos (bodies, 3)).
+    """The whole state of env as arrays: (state (S,), MuJoCo's xipos (bodies, 3)).
 
     `xipos` lags one step behind in MuJoCo, and Humanoid's reward reads it, so it must
     be kept too. Both are empty for a task that shows no state.
@@ -940,7 +957,7 @@ LARGEST = 1e38  # more than this does not fit into float32
 
 
 class Training:
-    """One run, as an iterator of `Record`s. It learns; its caller shows and measures.
+    """One run of a config, as an iterator of `Record`s. It learns; its caller measures.
 
         training = Training(Config("Pendulum-v1", "DDPG", seed=0))
         for record in training:
@@ -1100,7 +1117,7 @@ class Training:
         self.replay.add(*transition)
 
     def save(self, path):
-        """Write the state at the last episode's end to one `.npz`, whole or not at all.
+        """Write the state at the last episode's end to `path`, whole or not at all.
 
         At the end of the run it is the state then, even in the middle of an episode.
         """
@@ -1115,7 +1132,7 @@ class Training:
 
     @classmethod
     def load(cls, path):
-        """A Training that goes on where the file was written. ValueError if damaged."""
+        """A Training that goes on where `path` was written. ValueError if damaged."""
         content = read_npz(path)
         try:
             training = cls(Config.from_json(str(content["config"])))

@@ -23,7 +23,8 @@ which is no end of the world. The tasks are registered with "-v0" behind the nam
 
 All four are static, and the environments call the first three with N = 1. `gain` is
 the policy's, a = gain s, and matters for `LinearQuadratic` only: elsewhere Q either
-does not depend on the policy, or not after the action that is asked about.
+does not depend on the policy, or not after the action that is asked about. `rng` draws
+what is left to chance. A gamma outside [0, 1) is refused with a ValueError.
 """
 
 import gymnasium as gym
@@ -34,7 +35,8 @@ class Probe(gym.Env):
     """What the probes share: one action in [-1, 1], and a step made from `dynamics`.
 
     A subclass gives the four static functions of the module's table, and the largest
-    and smallest observations, `low` and `high`.
+    and smallest observations, `low` and `high`. There are no pictures: ValueError for a
+    `render_mode` other than None.
     """
 
     metadata = {"render_modes": []}
@@ -55,7 +57,10 @@ class Probe(gym.Env):
 
     @property
     def state(self):
-        """The state, (S,) float64: all that the future depends on. Settable."""
+        """The state, (S,) float64: all that the future depends on.
+
+        It can be set. ValueError for anything but S finite numbers.
+        """
         self._check_started()
         return self._states[0].copy()
 
@@ -68,11 +73,13 @@ class Probe(gym.Env):
         self._states = value[None]
 
     def reset(self, *, seed=None, options=None):
+        """Begin an episode → obs (O,), {}. `seed` as in Gymnasium; no `options`."""
         super().reset(seed=seed)
         self._states = self.start_states(self.np_random, 1)
         return self.observe(self._states)[0], {}
 
     def step(self, action):
+        """One step with action (1,) → obs (O,), reward, terminated, False, {}."""
         self._check_started()
         actions = np.asarray(action, np.float64).reshape(1, 1)
         self._states, rewards, terminated = self.dynamics(
@@ -95,7 +102,7 @@ class ConstantReward(Probe):
 
     @staticmethod
     def start_states(rng, n):
-        """One state only: 0. (N, 1)."""
+        """n starts (n, 1), all in the one state, 0."""
         return np.zeros((n, 1))
 
     @staticmethod
@@ -105,13 +112,13 @@ class ConstantReward(Probe):
 
     @staticmethod
     def dynamics(states, actions, rng=None):
-        """(N, 1), (N, 1) -> next_states (N, 1), rewards (N,), terminated (N,) bool."""
+        """states, actions (N, 1) -> next_states (N, 1), rewards, terminated (N,)."""
         n = len(states)
         return states.copy(), np.ones(n), np.zeros(n, bool)
 
     @staticmethod
     def true_q(obs, action, gamma, gain=None):
-        """1 / (1 - gamma) everywhere, (B,)."""
+        """1 / (1 - gamma) everywhere: obs (B, 1), action (B, 1) -> (B,)."""
         _check_gamma(gamma)
         return np.full(len(obs), 1.0 / (1.0 - gamma))
 
@@ -129,7 +136,7 @@ class RealEnd(Probe):
 
     @staticmethod
     def start_states(rng, n):
-        """All steps are left. (N, 1)."""
+        """n starts (n, 1): all steps are left."""
         return np.full((n, 1), float(RealEnd.length))
 
     @staticmethod
@@ -139,13 +146,13 @@ class RealEnd(Probe):
 
     @staticmethod
     def dynamics(states, actions, rng=None):
-        """(N, 1), (N, 1) -> next_states (N, 1), rewards (N,), terminated (N,) bool."""
+        """states, actions (N, 1) -> next_states (N, 1), rewards, terminated (N,)."""
         next_states = states - 1.0
         return next_states, np.ones(len(states)), next_states[:, 0] <= 0.0
 
     @staticmethod
     def true_q(obs, action, gamma, gain=None):
-        """(1 - gamma^k) / (1 - gamma) with k steps left, (B,)."""
+        """(1 - gamma^k) / (1 - gamma), k steps left: obs (B, 1), any action -> (B,)."""
         _check_gamma(gamma)
         k = np.rint(np.asarray(obs, np.float64)[:, 0] * RealEnd.length)
         return (1.0 - gamma**k) / (1.0 - gamma)
@@ -161,7 +168,7 @@ class ObservedReward(Probe):
 
     @staticmethod
     def start_states(rng, n):
-        """Uniform in [0, 1]. (N, 1)."""
+        """n starts (n, 1), drawn by rng uniformly from [0, 1]."""
         return rng.random((n, 1))
 
     @staticmethod
@@ -171,13 +178,13 @@ class ObservedReward(Probe):
 
     @staticmethod
     def dynamics(states, actions, rng):
-        """(N, 1), (N, 1) -> next_states (N, 1), rewards (N,), terminated (N,) bool."""
+        """states, actions (N, 1) -> next_states (N, 1), rewards, terminated (N,)."""
         n = len(states)
         return rng.random((n, 1)), states[:, 0].copy(), np.zeros(n, bool)
 
     @staticmethod
     def true_q(obs, action, gamma, gain=None):
-        """obs + gamma / (2 (1 - gamma)), (B,)."""
+        """obs + gamma / (2 (1 - gamma)): obs (B, 1), any action -> (B,)."""
         _check_gamma(gamma)
         return np.asarray(obs, np.float64)[:, 0] + gamma * 0.5 / (1.0 - gamma)
 
@@ -198,7 +205,7 @@ class TwoSteps(Probe):
 
     @staticmethod
     def start_states(rng, n):
-        """(steps taken, first action) = (0, 0). (N, 2)."""
+        """n starts (n, 2): (steps taken, first action) = (0, 0)."""
         return np.zeros((n, 2))
 
     @staticmethod
@@ -208,7 +215,10 @@ class TwoSteps(Probe):
 
     @staticmethod
     def dynamics(states, actions, rng=None):
-        """(N, 2), (N, 1) -> next_states (N, 2), rewards (N,), terminated (N,) bool."""
+        """One step of N copies: states (N, 2), actions (N, 1).
+
+        Returns next_states (N, 2), rewards (N,), terminated (N,) bool.
+        """
         first = states[:, 0] == 0.0
         next_states = states.copy()
         next_states[:, 0] += 1.0
@@ -218,12 +228,15 @@ class TwoSteps(Probe):
 
     @staticmethod
     def payment(first_action):
-        """What the first action earns: 1 - (a - 1/2)^2. (B,) -> (B,)."""
+        """What the first action a earns, 1 - (a - 1/2)^2: (B,) -> (B,)."""
         return 1.0 - (first_action - 0.5) ** 2
 
     @staticmethod
     def true_q(obs, action, gamma, gain=None):
-        """gamma payment(a) at the start, payment(kept) one step later, then 0: (B,)."""
+        """gamma payment(a) at the start, payment(kept) one step later, then 0.
+
+        obs (B, 2), action a (B, 1) -> (B,).
+        """
         _check_gamma(gamma)
         obs, action = np.asarray(obs, np.float64), np.asarray(action, np.float64)
         taken = np.rint(obs[:, 0] * 2.0)
@@ -259,7 +272,7 @@ class LinearQuadratic(Probe):
 
     @staticmethod
     def start_states(rng, n):
-        """Uniform in the box of `start`. (N, 2)."""
+        """n starts (n, 2), drawn by rng uniformly from the box of `start`."""
         start = np.array(LinearQuadratic.start)
         return rng.uniform(-start, start, (n, 2))
 
@@ -270,26 +283,29 @@ class LinearQuadratic(Probe):
 
     @staticmethod
     def dynamics(states, actions, rng=None):
-        """(N, 2), (N, 1) -> next_states (N, 2), rewards (N,), terminated (N,) bool."""
+        """One step of N copies: states (N, 2), actions (N, 1).
+
+        Returns next_states (N, 2), rewards (N,), terminated (N,) bool.
+        """
         actions = np.clip(actions, -1.0, 1.0)
         cost = LinearQuadratic.cost(states, actions)
         return LinearQuadratic.move(states, actions), -cost, np.zeros(len(states), bool)
 
     @staticmethod
     def move(states, actions):
-        """A x + B a for each row: (N, 2), (N, 1) -> (N, 2)."""
+        """A x + B a for each row: states x (N, 2), actions a (N, 1) -> (N, 2)."""
         return states @ LinearQuadratic.A.T + actions @ LinearQuadratic.B.T
 
     @staticmethod
     def cost(states, actions):
-        """x' C x + R a^2 for each row: (N, 2), (N, 1) -> (N,)."""
+        """x' C x + R a^2 for each row: states x (N, 2), actions a (N, 1) -> (N,)."""
         return _quadratic(states, LinearQuadratic.C) + _quadratic(
             actions, LinearQuadratic.R
         )
 
     @staticmethod
     def true_q(obs, action, gamma, gain=None):
-        """-(cost + gamma x' P x of the next state), (B,).
+        """-(cost + gamma x' P x of the next state): obs (B, 2), action (B, 1) -> (B,).
 
         gain: (1, 2), the policy a = gain x from the next step on, unclipped; None is
         the best policy. Raises ValueError where the gain lets the sum grow for ever.
@@ -310,7 +326,8 @@ def riccati(gamma):
     then cost(x, a) + gamma (A x + B a)' P (A x + B a) is least where its derivative
     by a is 0: at a = K x with K = -gamma (R + gamma B' P B)^-1 B' P A. Put in, that
     gives the new P. It is repeated until P stands still, and gamma < 1 makes it.
-    The best action is a = gain x, the true value is -x' P x.
+    The best action is a = gain x, the true value is -x' P x. ValueError for a gamma
+    outside [0, 1).
     """
     _check_gamma(gamma)
     A, B = LinearQuadratic.A, LinearQuadratic.B
@@ -330,8 +347,9 @@ def lyapunov(gain, gamma):
 
     P = C + K' R K + gamma (A + B K)' P (A + B K) is linear in the four numbers of P,
     so it is solved as a system of four equations.
-    gain: (1, 2). Raises ValueError for another shape, and where sqrt(gamma) (A + B K)
-    does not shrink every state: then the discounted cost is infinite.
+    gain: (1, 2). Raises ValueError for another shape, for a gamma outside [0, 1), and
+    where sqrt(gamma) (A + B K) does not shrink every state: then the discounted cost is
+    infinite.
     """
     _check_gamma(gamma)
     gain = np.asarray(gain, np.float64)

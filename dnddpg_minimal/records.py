@@ -45,6 +45,8 @@ def load_study(task=None, algorithm=None, variant="class", what="evaluations",
                folder=None, rule=None):
     """What was recorded. `None` for task, algorithm or variant means all of them.
 
+    folder: of the recordings, by default the package's.
+
     what="evaluations", "bias": one pandas DataFrame. A bias is that of the policy that
     acts; `rule="max_min"` or `"paired"` asks for that of the policy that chooses its
     action so (measured for two actors on Pendulum, MountainCar and the Arms).
@@ -147,8 +149,8 @@ def score(table, column="mean"):
     """A run's score, declared beforehand: the mean of its last ten evaluations.
 
     On MuJoCo of its last five; never the maximum over time. `table` holds a task's
-    evaluations, or rows of bias that were chosen to be one per evaluation. Returns a
-    Series over (task, algorithm, variant, seed).
+    evaluations, or rows of bias that were chosen to be one per evaluation; `column` is
+    the one that is scored. Returns a Series over (task, algorithm, variant, seed).
     """
     def last(runs):
         return runs.tail(5 if runs.name[0] in MUJOCO_TASKS else 10).mean()
@@ -175,6 +177,8 @@ def load_agent_at(weights, i=-1):
 
 def results(variant="class", folder=None):
     """Return and bias of every task and algorithm: mean, standard error, n of runs.
+
+    variant, folder: as in `load_study`.
 
     Each run counts by its `score`. The bias is the first critic's, at the policy's
     action: over start states, on MuJoCo over on-policy states. A DataFrame over (task,

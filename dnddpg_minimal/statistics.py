@@ -48,7 +48,8 @@ NORMALISER = {
 def scores(table, kind="end", column="mean"):
     """One number per run: a Series over (task, algorithm, seed).
 
-    table: evaluations as `load_study` gives them. kind:
+    table: evaluations as `load_study` gives them; column: the one that is scored, by
+    default the return. kind:
 
         "end"      the mean of the last ten evaluations (five on MuJoCo), study.score
         "whole"    the mean of all evaluations: the area under the learning curve
@@ -89,9 +90,10 @@ def scores(table, kind="end", column="mean"):
 
 
 def block_means(returns, block=10):
-    """Means of `block` episodes in a row: (E,) -> (E // block,). The rest is dropped.
+    """Means of `block` episodes in a row: returns (E,) -> (E // block,).
 
-    The paper's curves (section 4.4), where a block has 100 episodes.
+    Episodes that fill no block are dropped. The paper's curves (section 4.4), where a
+    block has 100 episodes.
     """
     returns = np.asarray(returns, np.float64)
     whole = len(returns) // block * block
@@ -119,6 +121,7 @@ def training_table(runs, block=10):
 def by_step(table, column="mean"):
     """Learning curves of one algorithm's runs on a task: (steps (M,), values (S, M)).
 
+    table: a row per run and step, as `load_study` gives them; column: what is drawn.
     Steps at which a run has no value are left out: the curves end with the shortest.
     """
     wide = table.pivot(index="step", columns="seed", values=column).dropna()
@@ -143,8 +146,8 @@ def curves(table, tasks):
 def band(values, axis=0):
     """Mean ± standard deviation of runs, as in the paper's Figure 6: (low, high).
 
-    It says where runs lie, not where their mean lies; it does not shrink with n. With
-    one run both are NaN.
+    values: a number per run, along `axis`. The band says where runs lie, not where
+    their mean lies; it does not shrink with n. With one run both are NaN.
     """
     values = np.asarray(values, np.float64)
     if values.shape[axis] < 2:
@@ -154,9 +157,11 @@ def band(values, axis=0):
 
 
 def t_interval(values, confidence=CONFIDENCE, axis=0):
-    """Mean ± t·s/√n, Student's interval: (low, high), along `axis`.
+    """Mean ± t·s/√n, Student's interval: (low, high).
 
-    s is the standard deviation with n − 1. Exact for normal runs. With one run NaN.
+    values: n runs along `axis`; s is their standard deviation with n − 1. If the runs
+    are normal, a share `confidence` of such intervals holds the true mean. With one run
+    NaN.
     """
     values = np.asarray(values, np.float64)
     n = values.shape[axis]
@@ -169,11 +174,12 @@ def t_interval(values, confidence=CONFIDENCE, axis=0):
 
 def bootstrap_interval(values, confidence=CONFIDENCE, method="percentile", axis=0,
                        resamples=2_000, seed=0):
-    """Bootstrap interval of the mean: (low, high), along `axis`.
+    """Bootstrap interval of the mean: (low, high).
 
-    Draw n of the n runs with replacement, again and again, and keep the middle 95 % of
-    the means (Efron 1979). method: "percentile", or "BCa", which corrects its bias and
-    skewness. One run, or runs that are all equal: see `t_interval`.
+    values: n runs along `axis`. Draw n of them with replacement, `resamples` times, and
+    keep the middle share `confidence` of the means (Efron 1979). method: "percentile",
+    or "BCa", which corrects its bias and skewness. `seed` fixes the draws. One run, or
+    runs that are all equal: see `t_interval`.
     """
     values = np.moveaxis(np.asarray(values, np.float64), axis, 0)
     if len(values) < 2:
@@ -219,7 +225,7 @@ def paired(scores, first, second):
 def normalised(scores):
     """(score − random) / (reference − random), with NORMALISER: a Series like `scores`.
 
-    KeyError for a task that has no entry.
+    scores: a Series with a level "task". KeyError for a task that has no entry.
     """
     low, high = np.array([NORMALISER[task] for task in
                           scores.index.get_level_values("task")]).reshape(-1, 2).T
@@ -227,7 +233,7 @@ def normalised(scores):
 
 
 def size_of(task):
-    """Return units between 0 and 1 of the NORMALISER."""
+    """Units of return between 0 and 1 of a task's NORMALISER."""
     low, high = NORMALISER[task]
     return high - low
 
@@ -235,8 +241,8 @@ def size_of(task):
 def interquartile_mean(values, axis=-1):
     """The mean of the middle half: a quarter of the values is cut off at each end.
 
-    Of 3 values it is the plain mean, of 5 the mean of the middle three, of 10 that of
-    the middle six: the number cut off is rounded down.
+    Along `axis`. Of 3 values it is the plain mean, of 5 the mean of the middle three,
+    of 10 that of the middle six: the number cut off is rounded down.
     """
     return stats.trim_mean(values, 0.25, axis=axis)
 
@@ -245,8 +251,9 @@ def iqm_interval(samples, confidence=CONFIDENCE, resamples=2_000, seed=0):
     """Interquartile mean over tasks, and its stratified bootstrap: (iqm, low, high).
 
     samples: a list of (n,), one per task, normalised. Runs are drawn anew within each
-    task, never tasks: the interval is about these tasks. NaN with fewer than FEWEST
-    runs in a task.
+    task, never tasks: the interval is about these tasks. confidence, resamples, seed:
+    as in `bootstrap_interval`. low and high are NaN with fewer than FEWEST runs in a
+    task. Agarwal et al. 2021.
     """
     iqm = float(interquartile_mean(np.concatenate(samples)))
     if min(map(len, samples)) < FEWEST:
@@ -291,12 +298,12 @@ def profile(samples, levels):
 
 
 def paper_budget(task):
-    """The paper's section 4.3: (rounds, longest round in steps)."""
+    """The task in the paper's section 4.3: (rounds, longest round in steps)."""
     return (5_000, 1_000) if task in MUJOCO_TASKS else (2_000, 300)
 
 
 def share_of_the_paper(task, steps):
-    """Our steps as a share of the paper's, at least.
+    """Our steps on a task as a share of the paper's, at least.
 
     The paper's rounds that end early have fewer steps, so the true share may be larger.
     """
@@ -307,8 +314,9 @@ def share_of_the_paper(task, steps):
 def settled(table, task, tolerance=0.05):
     """Have the learning curves of a task come to rest? A bool.
 
-    True if from the third to the last quarter of the evaluations the mean over runs
-    moves by less than `tolerance` of the NORMALISER's size, for every algorithm.
+    table: evaluations as `load_study` gives them. True if from the third to the last
+    quarter of the evaluations the mean over runs moves by less than `tolerance` of the
+    NORMALISER's size, for every algorithm.
     """
     table = table[table.task == task]
     if table.empty:
@@ -323,7 +331,8 @@ def settled(table, task, tolerance=0.05):
 def tested(table, task):
     """May a claim about the whole of the paper's training be judged? A bool.
 
-    Yes with half of the paper's steps, or with a twentieth if the curves are settled.
+    table, task: as in `settled`. Yes with half of the paper's steps on the task, or
+    with a twentieth if the curves are settled.
     """
     table = table[table.task == task]
     share = share_of_the_paper(task, table.step.max() if len(table) else 0)
@@ -345,8 +354,9 @@ def verdict(differences, claim="greater", margin=0.0, tested=True,
         "not tested (n = 1)"         fewer than three differences
 
     differences (n,). claim: "greater" than `margin`, "less" than −`margin`, or "same":
-    within ± `margin`. ValueError for another claim, a negative margin, and for "same"
-    without a margin, which no measurement could ever confirm.
+    within ± `margin`. confidence: that of the interval. ValueError for another claim, a
+    negative margin, and for "same" without a margin, which no measurement could ever
+    confirm.
     """
     if claim not in ("greater", "less", "same"):
         raise ValueError(f"claim={claim!r}: expected greater, less or same.")

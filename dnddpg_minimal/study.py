@@ -107,6 +107,8 @@ def list_of(budget):
     quick  every task and algorithm, seconds each: does everything work?
     class  what is recorded and shipped
     paper  section 4.3 of the paper: Table 1, 2 000 or 5 000 episodes; ten seeds
+
+    ValueError for another budget.
     """
     lists = {"quick": _quick, "class": _class, "paper": _paper}
     if budget not in lists:
@@ -240,7 +242,7 @@ class Notes:
         self.pictures = {}  # step: dict of arrays
 
     def save(self, path):
-        """Write the notes to one file, whole or not at all."""
+        """Write the notes to one file at `path`, whole or not at all."""
         rows = dict(evaluations=self.evaluations, bias=self.bias, probe=self.probe,
                     seconds=self.seconds, code=code())
         arrays = {f"{step}/{name}": array for step, arrays in self.pictures.items()
@@ -249,7 +251,10 @@ class Notes:
 
     @classmethod
     def load(cls, path, until):
-        """The notes up to the step `until`: later ones will be made again."""
+        """The notes at `path` up to the step `until`: later ones will be made again.
+
+        ValueError for a damaged file, and for one that other code wrote.
+        """
         content, notes = read_npz(path), cls()
         rows = json.loads(str(content.pop("rows")))
         if rows["code"] != code():
@@ -266,7 +271,7 @@ class Notes:
 
 
 def measure(run, training, item, notes):
-    """Look at the run at one of its records `item`, and note it. Changes no run."""
+    """Look at a training at one of its records `item`, and note it. Changes no run."""
     config, step = run.config, training.step
     if step == PROBE_STEP and notes.probe is None:
         notes.probe = fingerprint(training)
@@ -299,7 +304,7 @@ def measure(run, training, item, notes):
 
 
 def fingerprint(training):
-    """The weights in few words: a dict that is equal only if they are, bit for bit."""
+    """A training's weights in a short dict: equal only if they are, bit for bit."""
     theta = np.asarray(training.agent.arrays()["theta"])
     return dict(step=training.step, sum=float(theta.sum(dtype=np.float64)),
                 sha256=hashlib.sha256(theta.tobytes()).hexdigest())
@@ -330,7 +335,10 @@ def _plain(row):
 
 
 def finish(run, training, notes):
-    """The record of a run that is over: a dict of arrays; `meta` says what is what."""
+    """The record of a run whose training is over, with its notes: a dict of arrays.
+
+    `meta` says what is what.
+    """
     config, agent = run.config, training.agent
     owed_to(notes.bias, config)
     episodes = [(r.step, r.length, r.episode_return) for r in training.records
@@ -385,7 +393,10 @@ def owed_to(rows, config):
 
 
 def visits(task, replay):
-    """How many states of the replay memory lie in each cell: (BINS y, BINS x)."""
+    """How many states of the replay memory lie in each cell: (BINS y, BINS x).
+
+    task: one of PLANES, which says what a cell is.
+    """
     project, (range_x, range_y) = PLANES[task]
     x, y = project(replay.arrays.obs[:replay.size].astype(np.float64))
     counts, _, _ = np.histogram2d(y, x, bins=BINS, range=(range_y, range_x))
@@ -420,7 +431,10 @@ def writable(folder, option):
 
 
 class Checkpoint:
-    """The files of one unfinished run: its Training, its Notes, its lock."""
+    """The files of one unfinished run: its Training, its Notes, its lock.
+
+    They lie in `scratch`; `folder` is where the record will be.
+    """
 
     def __init__(self, run, folder, scratch=None):
         self.run = run
@@ -432,7 +446,7 @@ class Checkpoint:
             ("training.npz", "notes.npz", "record.npz", "lock", "status"))
 
     def save(self, training, notes):
-        """Write both, so that a run killed at any moment goes on from here."""
+        """Write training and notes: a run killed at any moment goes on from here."""
         notes.save(self.notes)  # first: notes may know more than the Training, not less
         training.save(self.training)
 
@@ -449,7 +463,7 @@ class Checkpoint:
         return kind(self.run.config), Notes()
 
     def show(self, training):
-        """Say how far the run is, for the study's progress bar."""
+        """Say how far a training is, for the study's progress bar."""
         config = training.config
         part = (training.step / config.steps if config.episodes is None
                 else training.episode / config.episodes)
@@ -463,7 +477,7 @@ class Checkpoint:
         return 0.0
 
     def sweep(self, path):
-        """Remove what processes that were killed left half written."""
+        """Remove what killed processes left half written, beside `path` too."""
         for whole in (self.training, self.notes, path):
             for part in whole.parent.glob(f"{whole.name}.*.part"):  # see write_npz
                 part.unlink(missing_ok=True)
@@ -479,7 +493,10 @@ HELD = errno.EACCES, errno.EAGAIN, errno.EDEADLK  # "another process has the loc
 
 @contextmanager
 def only_one(path):
-    """True inside `with` for one process at a time. The lock dies with its process."""
+    """True inside `with` for one process at a time; `path` is the lock's file.
+
+    The lock dies with its process.
+    """
     with open(path, "a+b") as file:
         try:
             if os.name == "nt":
@@ -500,7 +517,7 @@ def only_one(path):
 
 
 def write_record(path, arrays):
-    """Write a record into its folder, compressed, whole or not at all."""
+    """Write a record's arrays to `path`, compressed, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_npz(path, save=np.savez_compressed, **arrays)
 
@@ -554,7 +571,10 @@ def code():
 
 
 class Slot:
-    """A process of its own, for one run at a time: its death harms no other run."""
+    """A process of its own, for one run at a time: its death harms no other run.
+
+    nice: how much it stands back for other processes.
+    """
 
     room = 1
 
@@ -586,7 +606,7 @@ class Slot:
 
 
 class Cluster:
-    """All of a Dask cluster. It does lost runs again by itself."""
+    """All of the Dask cluster at an address. It does lost runs again by itself."""
 
     room = 10**9
 
@@ -643,7 +663,10 @@ def study(runs, folder=RECORDINGS, scratch=None, workers=2, nice=10, scheduler=N
     `workers` processes do one run each at a time; with `scheduler`, an address, a Dask
     cluster does them. `report(done, running)` is called about once a second, with the
     names of the runs that ended just now and the `Checkpoint`s of those that go on. A
-    run whose process dies is done again, at most three times.
+    run whose process dies is done again, at most three times. folder, scratch, every:
+    as in `record`; nice: how much the workers stand back for other processes.
+
+    ValueError for fewer than one worker, OSError where nothing can be written.
     """
     if workers < 1:
         raise ValueError(f"workers={workers}: expected 1 or more.")
@@ -745,6 +768,8 @@ def command(
 ) -> int:
     """Do the runs of a budget that are missing. Ctrl-C stops; the same command goes on.
 
+    A choice that leaves no run is refused.
+
     Args:
         budget: quick (seconds each), class (what is shipped), paper (section 4.3).
         task: only these tasks.
@@ -808,7 +833,7 @@ def stoppable():
 
 
 class Progress:
-    """One bar for the whole study, and what each worker does. Lines in a file."""
+    """One bar for all runs of a study, and what each worker does. Lines in a file."""
 
     def __init__(self, runs):
         from tqdm import tqdm
@@ -838,7 +863,7 @@ class Progress:
 
 
 def rough_work(config):
-    """A rough measure of a run's work, to weigh the runs in one progress bar."""
+    """A rough measure of the work of a config's run, for one progress bar."""
     steps = config.steps or config.episodes * (config.max_episode_steps or 1_000)
     weights = sum(a * b for a, b in itertools.pairwise((*config.hidden, 1)))
     products = config.batch_size * weights * (2 * config.critics + config.actors)
@@ -846,7 +871,10 @@ def rough_work(config):
 
 
 def tell(runs, missing, folder, scratch, timed, workers):
-    """Print what is there and what is missing, by task and variant; `timed`: hours."""
+    """Print which runs are there and which are missing, by task and variant.
+
+    folder, scratch: as in `record`. timed: also the hours, with so many workers.
+    """
     groups, total = {}, 0.0
     for run in runs:
         groups.setdefault((run.config.task, run.variant), []).append(run)
@@ -872,7 +900,7 @@ def tell(runs, missing, folder, scratch, timed, workers):
 
 
 def seconds_of(config):
-    """Seconds that a run will take here, from a short one of the same sizes.
+    """Seconds that a config's run will take here, from a short one of the same sizes.
 
     An upper bound where episodes end early (Hopper, Walker2d, Humanoid).
     """
@@ -887,7 +915,10 @@ def seconds_of(config):
 
 @cache
 def probe(task, algorithm, hidden, batch_size, updates_per_step):
-    """Seconds of one step with its updates, of one evaluation, of all the full ones."""
+    """Seconds of one step with its updates, of one evaluation, of all the full ones.
+
+    Measured on a short run with these fields of `Config`.
+    """
     config = Config(task, algorithm, hidden=hidden, batch_size=batch_size, steps=300,
                     updates_per_step=updates_per_step, warmup=150, yield_every=50)
     clock = {}  # step: seconds of processor time

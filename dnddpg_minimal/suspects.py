@@ -88,7 +88,7 @@ def _dealt():
 def load(letter, what="evaluations", folder=None):
     """`records.load_study` of the agent behind a letter; its variant reads `letter`.
 
-    Raises ValueError for an unknown letter.
+    what, folder: as in `load_study`. Raises ValueError for an unknown letter.
     """
     fault = _dealt()[_place(letter)]
     found = records.load_study(algorithm="DDPG", variant=f"bug={fault}", what=what,
@@ -99,7 +99,10 @@ def load(letter, what="evaluations", folder=None):
 
 
 def task_of(letter):
-    """The task on which the agent behind a letter was trained."""
+    """The task on which the agent behind a letter was trained.
+
+    Raises ValueError for an unknown letter.
+    """
     return BUGS[_dealt()[_place(letter)]][0]
 
 

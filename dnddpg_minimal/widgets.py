@@ -49,7 +49,7 @@ def panel(title, sliders, draw, size=(6.4, 2.9), lines=1, still=()):
 
     `draw(figure, **values)` fills an empty matplotlib Figure and returns the text, or
     with `lines` above 1 a tuple of so many lines. It is called now, and again whenever
-    a slider moves.
+    a slider moves. `size` is the figure's, in inches; `title` names the panel in print.
 
     Most of the time goes into axes, ticks and maps. Where `still` names the sliders
     that change them, the figure is emptied only when one of those moves. Otherwise
@@ -98,7 +98,10 @@ def image_of(figure):
 
 
 def slider(label, value, low, high, step):
-    """A slider of whole numbers, or of numbers, with its name in full beside it."""
+    """A slider from `low` to `high` that begins at `value`, with its `label` beside it.
+
+    It moves over whole numbers if `step` is an int, else over numbers.
+    """
     whole = isinstance(step, int)
     kind = ipywidgets.IntSlider if whole else ipywidgets.FloatSlider
     more = {} if whole else {"readout_format": ".2f"}
@@ -109,7 +112,7 @@ def slider(label, value, low, high, step):
 
 # --- The maximisation laboratory: chapters 04 to 06 -----------------------------------
 
-DRAWS = 10_000  # simulated targets
+DRAWS = 10_000  # of y
 RULES = ("max_min", "single", "paired_min", "selected", "soft")
 LABORATORY = {  # label, lowest, highest, step
     "actors": ("number of actions, K", 1, 30, 1),
@@ -122,7 +125,7 @@ LABORATORY = {  # label, lowest, highest, step
 
 
 def expected_max(n):
-    """m_n: the mean of the largest of n independent standard normal numbers.
+    """m_n of Eq. (4.2): the mean of the largest of n independent standard normals.
 
     The largest lies below z if all n do, so its density is n φ(z) Φ(z)^(n-1).
     """
@@ -133,13 +136,14 @@ def expected_max(n):
     return float(np.sum(z * n * density * below ** (n - 1)) * (z[1] - z[0]))
 
 
-def simulated_targets(critics=1, actors=2, sigma=1.0, rho=0.0, kappa=1.0, gap=0.0,
-                      rule="max_min", draws=DRAWS):
-    """What a target says of a next state whose best action is truly worth 0: (draws,).
+def simulated_y(critics=1, actors=2, sigma=1.0, rho=0.0, kappa=1.0, gap=0.0,
+                rule="max_min", draws=DRAWS):
+    """y of a next state whose best action is truly worth 0, by `rule`: (draws,).
 
-    The errors e[c, k] are normal, mean 0, standard deviation σ. Two actions within one
-    critic correlate by ρ, two critics at one action by κ, both at once by κρ; ρ and κ
-    lie between 0 and 1. The first action is worth 0, the others −gap.
+    The errors e[c, k] of the critics at the actors' actions are normal, mean 0,
+    standard deviation σ. Two actions within one critic correlate by ρ, two critics at
+    one action by κ, both at once by κρ; ρ and κ lie between 0 and 1. The first action
+    is worth 0, the others −gap. `rule` is a `target_rule`.
     """
     rng = stream(0, "noise")
 
@@ -158,7 +162,10 @@ def simulated_targets(critics=1, actors=2, sigma=1.0, rho=0.0, kappa=1.0, gap=0.
 
 def closed_form(critics=1, actors=2, sigma=1.0, rho=0.0, kappa=1.0, gap=0.0,
                 rule="max_min"):
-    """The mean of `simulated_targets`, or None where we know no formula."""
+    """The mean of `simulated_y` with these arguments, or None without a formula.
+
+    Eq. (5) with one critic, Eq. (11) with one action, `bias.predict` up to two of each.
+    """
     if gap > 0 and actors > 1:
         return None
     if critics == 1 and rule == "max_min":  # Eq. 5
@@ -204,13 +211,13 @@ def maximisation_laboratory(sliders=("actors", "sigma", "rho"), rule="max_min",
 
     def draw(figure, **moved):
         now = usual | moved
-        targets = simulated_targets(rule=rule, **now)
+        y = simulated_y(rule=rule, **now)
         formula = closed_form(rule=rule, **now)
         ax = figure.add_axes((0.02, 0.16, 0.96, 0.8))
-        plots.plot_targets(targets, formula, ax)
+        plots.plot_y(y, formula, ax)
         known = ("none known here" if formula is None
                  else f"{round(formula, 2) + 0.0:+.2f}")  # no "−0.00"
-        return (f"Bias of one target: simulated {targets.mean():+.2f}, "
+        return (f"Bias of one target: simulated {y.mean():+.2f}, "
                 f"closed form {known}. Truth 0.")
 
     moving = {name: slider(LABORATORY[name][0], usual[name], *LABORATORY[name][1:])
@@ -309,7 +316,11 @@ LIMIT = 80  # where the explorer's colours end: the same for all, to compare
 
 
 def follow(world, agent, state, steps=500):
-    """One rollout from state (1, S): its first SHOWN states, and its truth."""
+    """One rollout of an agent in a world of `bias.dynamics`, from state (1, S).
+
+    Returns its first SHOWN states (T, S), and the truth: the discounted sum of `steps`
+    rewards.
+    """
     path, truth = [], 0.0
     for t in range(steps):
         if t < SHOWN:
@@ -367,6 +378,7 @@ def recorded_arm_agents(folder=None):
     """Recorded DN-DDPG agents of the Arms at the end: a dict from a name to an agent.
 
     The lowest seed with weights of each task; a task without any is not in the dict.
+    `folder` holds recordings, by default those of the package.
     """
     from dnddpg_minimal.study import load_agent_at, load_study
 
@@ -401,7 +413,7 @@ def look_at_arm(agent, state):
 
 
 def proposals_in_words(seen):
-    """The proposals of `look_at_arm`, for the text below the sliders."""
+    """The proposals in `seen`, of `look_at_arm`, for the text below the sliders."""
     words = []
     for k, action in enumerate(seen["actions"]):
         values = ", ".join(f"Q{c + 1} {q:.2f}" for c, q in enumerate(seen["q"][:, k]))
@@ -479,7 +491,11 @@ def figure_6_explorer(folder=None):
 
 
 def draw_curve(ax, x, values, of_interval, style, name):
-    """Runs as thin lines, their mean as a thick one, an interval as a shade."""
+    """Runs as thin lines, their mean as a thick one, an interval as a shade.
+
+    x (M,), values (S, M). `of_interval` makes (low, high) of values; style: of lines,
+    for Matplotlib; name: for the legend.
+    """
     if len(values) > 1:
         ax.fill_between(x, *of_interval(values), color=style["color"], alpha=0.25,
                         linewidth=0)
@@ -491,7 +507,7 @@ def draw_curve(ax, x, values, of_interval, style, name):
 
 
 def menu(label, options):
-    """A menu of `options`, the first one chosen, with its name in full beside it."""
+    """A menu of `options`, the first one chosen, with its `label` in full beside it."""
     options = list(options)
     return ipywidgets.Dropdown(options=options, value=options[0], description=label,
                                style={"description_width": "18em"},
@@ -506,7 +522,8 @@ class LiveTraining(Panel):
 
     The loop runs in a thread of its own, so that the buttons are heard. Nothing starts
     by itself. After a stop, or at the end, `training` holds the Training; start begins
-    a new run of the same config, with the same numbers.
+    a new run of the same config, with the same numbers. A config that counts episodes
+    is refused with a ValueError: the panel counts steps.
     """
 
     def __init__(self, config):

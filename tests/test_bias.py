@@ -495,6 +495,25 @@ def test_on_the_linear_quadratic_probe_the_truth_is_riccatis():
     assert picture["truth"][0, 2] == pytest.approx(closed[0], rel=1e-4)
 
 
+def test_a_trained_agents_bias_there_is_that_of_steps_made_by_hand():
+    config = Config("LinearQuadratic-v0", "DCN-DDPG", steps=900, warmup=300)
+    training = Training(config)
+    for _ in training:
+        pass
+    agent, found = training.agent, instrument.evaluate(training)
+    world, task = instrument.dynamics(config), probes.LinearQuadratic
+    states = world.reset(stream(0, "evaluation", 900), 100)
+    truth, now = np.zeros(100), states
+    for step in range(200):  # 0.9^200 is nothing
+        now, reward, _ = task.dynamics(now, agent.act(task.observe(now)))
+        truth += config.gamma**step * reward
+    obs = task.observe(states)
+    bias = (agent.q_values(obs, agent.act(obs)) - truth).mean(axis=1)
+    rows = [r for r in found.bias if (r["states"], r["action"]) == ("start", "policy")]
+    assert np.allclose([row["bias"] for row in rows[:2]], bias, atol=1e-4)
+    assert np.abs(bias).max() > 1e-3  # there is something to be found
+
+
 # --- What the bias should be ---
 
 

@@ -1,5 +1,7 @@
 """The project as a whole: its commands, its pins, its notebooks, its files."""
 
+import ast
+import dataclasses
 import importlib
 import inspect
 import json
@@ -197,15 +199,72 @@ def test_every_public_name_has_a_docstring():
     assert not silent
 
 
-@pytest.mark.parametrize("name", dnddpg_minimal.__all__)
+def exported_functions():
+    """(name, function, what is said of it) of all that the package exports.
+
+    Of a class these are its methods, inherited ones too; what is said may stand in the
+    method's docstring or in the class's. The fields of a Config, a Batch or a Record
+    have comments instead.
+    """
+    for name in dnddpg_minimal.__all__:
+        thing = getattr(dnddpg_minimal, name)
+        if inspect.isfunction(thing):
+            yield name, thing, inspect.getdoc(thing)
+        if inspect.isclass(thing):
+            said = [inspect.getdoc(one) for one in thing.__mro__
+                    if one.__module__.startswith("dnddpg_minimal")]
+            if not (dataclasses.is_dataclass(thing) or hasattr(thing, "_fields")):
+                yield f"{name}.__init__", thing.__init__, " ".join(said)
+            for part, member in inspect.getmembers(thing, inspect.isroutine):
+                where = getattr(member, "__module__", None) or ""
+                if not part.startswith("_") and where.startswith("dnddpg_minimal"):
+                    own = inspect.getdoc(member) or ""
+                    yield f"{name}.{part}", member, " ".join([own, *said])
+
+
+EXPORTED = {name: (thing, said) for name, thing, said in exported_functions()}
+
+
+@pytest.mark.parametrize("name", EXPORTED)
 def test_the_docstring_of_an_exported_function_names_its_arguments(name):
-    thing = getattr(dnddpg_minimal, name)
-    if not inspect.isfunction(thing):
-        pytest.skip("no function")
-    said, symbols = inspect.getdoc(thing), {"gamma": "γ", "nu": "ν"}
-    missing = [word for word in inspect.signature(thing).parameters
-               if word not in said and symbols.get(word, word) not in said]
+    thing, said = EXPORTED[name]
+    words = inspect.signature(thing).parameters.keys() - {"self"}
+    symbols = {"gamma": "γ", "nu": "ν"}
+    missing = [word for word in words
+               if not re.search(rf"\b({word}|{symbols.get(word, word)})\b", said)]
     assert not missing
+
+
+def functions_that_refuse():
+    """(name, what is said of it) of public functions with a `raise ValueError` inside.
+
+    A constructor is described by its class, what sets a property by what gets it.
+    """
+    for path in sorted(Path(dnddpg_minimal.__file__).parent.rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        owners = [tree, *(one for one in tree.body if isinstance(one, ast.ClassDef))]
+        for owner in owners:
+            inside = [one for one in owner.body if isinstance(one, ast.FunctionDef)]
+            for one in inside:
+                if one.name.startswith("_") and one.name != "__init__":
+                    continue
+                raised = [ast.unparse(part.exc).partition("(")[0]
+                          for part in ast.walk(one)
+                          if isinstance(part, ast.Raise) and part.exc]
+                if "ValueError" in raised:
+                    about = [owner] if one.name == "__init__" else [
+                        other for other in inside if other.name == one.name]
+                    place = [path.stem, getattr(owner, "name", None), one.name]
+                    yield (".".join(filter(None, place)),
+                           " ".join(ast.get_docstring(node) or "" for node in about))
+
+
+def test_a_docstring_says_that_a_value_is_refused():
+    found = dict(functions_that_refuse())
+    assert len(found) > 20
+    silent = [name for name, said in found.items()
+              if "ValueError" not in said and "refused" not in said]
+    assert not silent
 
 
 # --- the book's links -----------------------------------------------------------------

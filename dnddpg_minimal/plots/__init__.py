@@ -24,7 +24,7 @@ caller, who knows it, passes them.
 | `plot_slope_ways(gain, slope, ways)` | one slope, found in several ways |
 | `plot_actor(position, best, actors)` | an actor's actions beside the best ones |
 | `plot_price(slopes, bias, lost)` | what a critic's slope costs |
-| `plot_targets(targets, expected)` | what one noisy target says, as a histogram |
+| `plot_y(y, expected)` | what one noisy target says, as a histogram |
 | `plot_maximum(…)` | the same, and its mean over the number of actions |
 | `plot_growth(panels)` | a bias made anew in each target, piling up |
 | `plot_steps(curves, points)` | two actors' steps on a true and a learned Q |
@@ -138,6 +138,7 @@ from dnddpg_minimal.plots.overestimation import (
     plot_owed,
     plot_steps,
     plot_targets,
+    plot_y,
 )
 from dnddpg_minimal.plots.paper_court import (
     plot_consequences,
@@ -209,5 +210,5 @@ __all__ = [
     "plot_reaching", "plot_readings", "plot_restored", "plot_returns", "plot_runs",
     "plot_slices", "plot_slope_ways", "plot_steps", "plot_table_1", "plot_targets",
     "plot_true_q", "plot_truth", "plot_verdicts", "plot_visits", "plot_who_acts",
-    "shrink", "style_of", "thousands", "write_bodies", "zero_line",
+    "plot_y", "shrink", "style_of", "thousands", "write_bodies", "zero_line",
 ]

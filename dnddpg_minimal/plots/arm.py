@@ -27,7 +27,10 @@ FATES = {"arrives and stays": "#009E73", "crosses the edge": "#E69F00",
 
 
 def draw_arm(ax, state, colour="0.35", alpha=1.0, **more):
-    """One arm on axes in px from the base: links, elbow, finger. state (5,)."""
+    """One arm on axes in px from the base: links, elbow, finger. state (5,).
+
+    colour, alpha and whatever `more` says are the links', as Matplotlib knows them.
+    """
     elbow, finger = arm.locate(np.atleast_2d(state)[:, :2])[0]
     x, y = np.array([[0, 0], elbow, finger]).T
     ax.plot(x, y, color=colour, linewidth=4, alpha=alpha, solid_capstyle="round",
@@ -108,7 +111,10 @@ def draw_opinion(ax, q):
 
 
 def draw_joints(ax, values, colours, low=None, high=None, norm=None):
-    """A map over the two joints, 0 to 2π each; values [joint 2, joint 1]."""
+    """A map over the two joints, 0 to 2π each; values (N, N), [joint 2, joint 1].
+
+    colours: a colour map, from `low` to `high` or by `norm`, as Matplotlib's imshow.
+    """
     turn = 2 * np.pi
     image = ax.imshow(values, origin="lower", extent=(0, turn, 0, turn), cmap=colours,
                       vmin=low, vmax=high, norm=norm, interpolation="nearest")
@@ -119,7 +125,7 @@ def draw_joints(ax, values, colours, low=None, high=None, norm=None):
 
 
 def draw_goal_over_joints(ax, goal=arm.EASY_GOAL):
-    """The edge of the goal over the two joints: one spot for each elbow branch."""
+    """The edge of the goal (xy), px, over the two joints: a spot for each branch."""
     side = np.linspace(0, 2 * np.pi, 161)
     states = np.zeros((side.size**2, 5))
     states[:, 0], states[:, 1] = np.tile(side, side.size), np.repeat(side, side.size)

@@ -27,8 +27,8 @@ def plot_one_backup(x, forms, samples, measured=None, xlabel="", legend="best",
 
     x (N,); forms: a dict from a label to (N,), in units of σ; samples: the same labels
     to (x, bias) of simulated errors. measured: (low, high), the range of x that was
-    measured on trained critics, drawn as a grey band.
-    legend: its place, as Matplotlib's `loc`.
+    measured on trained critics, drawn as a grey band. xlabel: what x is; legend: its
+    place, as Matplotlib's `loc`.
     """
     if ax is None:
         _, ax = plt.subplots(figsize=(6.4, 3.2), layout="constrained")
@@ -110,7 +110,7 @@ def plot_parts(parts, ax=None, title=""):
 
 
 def note_mean(ax, error):
-    """Write the mean of a map into its corner."""
+    """Write the mean of a map of errors (N, N) into its corner."""
     ax.annotate(f"mean {error.mean():+.0f}".replace("-", "−"), (0.97, 0.04),
                 xycoords="axes fraction", ha="right", fontsize=8.5,
                 bbox=dict(facecolor="white", edgecolor="none", pad=1))

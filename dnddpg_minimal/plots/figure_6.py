@@ -21,7 +21,8 @@ def plot_eight_tasks(curves, interval=None, seeds=False, limits=None, xlabel="",
     curves: a dict from a task to a dict from an algorithm to (x (M,), values (S, M));
     a task without algorithms gets an empty panel that says how to record it. interval:
     a function of values that gives (low, high), drawn as a shade from 3 runs on; seeds:
-    every run as a thin line; limits: a dict from a task to its axis' (low, high).
+    every run as a thin line; limits: a dict from a task to its axis' (low, high);
+    xlabel: what x is.
     """
     if axes is None:
         rows = -(-len(curves) // 4)
@@ -70,7 +71,7 @@ def short(task):
 
 
 def not_recorded(ax, task):
-    """An empty panel that says what would fill it."""
+    """An empty panel that says what would fill it: a study of the task."""
     text = f"not recorded yet:\npython -m\ndnddpg_minimal\nstudy --task\n{task}"
     ax.text(0.5, 0.5, text, transform=ax.transAxes, ha="center", va="center",
             fontsize=6.5, color="0.35")
@@ -81,6 +82,7 @@ def plot_coverage(n, shares, claimed=0.95, axes=None, title=""):
     """How often intervals hold the truth, over the number of runs: a panel per law.
 
     n (N,); shares: a dict from a law to a dict from a kind of interval to (N,).
+    claimed: the share that the intervals promise.
     """
     if axes is None:
         figure, axes = plt.subplots(1, len(shares), figsize=(7, 2.6), sharey=True,
@@ -139,7 +141,8 @@ def plot_paired_by_task(differences, axes=None, title="", xlabel=""):
 
     differences: a dict from a pair's name to a dict from a task to (values (n,) in %, t
     interval, bootstrap interval), in the colours of `plot_coverage`. Fewer than 3
-    values: rings only. The axis is linear within ±1 and logarithmic beyond.
+    values: rings only. xlabel: what the values are. The axis is linear within ±1 and
+    logarithmic beyond.
     """
     if axes is None:
         rows = max(map(len, differences.values()))

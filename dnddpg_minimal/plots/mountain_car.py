@@ -43,7 +43,10 @@ def plot_energy_paths(x, y, energy, paths, ax=None, title=""):
 
 
 def goal_line(ax, x, y, energy, color="black"):
-    """The line of the goal's energy, and the flag."""
+    """The line of the goal's energy, and the flag, in a color.
+
+    x (N,), y (M,) and energy (M, N) as in `plot_energy_paths`.
+    """
     energy = np.where(x > GOAL + 0.01, np.nan, energy)  # beyond it the hill falls again
     ax.contour(x, y, energy, [1.0], colors=color, linewidths=1.6, linestyles="--",
                antialiased=False)

@@ -77,14 +77,17 @@ def photograph(task, size=420):
 
 
 def places_in_obs(body, joint):
-    """Where a joint's angle and its velocity stand in the observation: two indices."""
+    """Two indices: where a body's joint, an index too, has its angle and its velocity.
+
+    Both count in the observation.
+    """
     parts, model = body.observation_structure, body.model
     return (int(model.jnt_qposadr[joint]) - parts["skipped_qpos"],
             int(model.jnt_dofadr[joint]) + parts["qpos"])
 
 
 def torso_label(body):
-    """What the observation holds of the torso, and what it leaves out."""
+    """What the observation holds of a body's torso, and what it leaves out."""
     hidden, n = (body.observation_structure[name] for name in ("skipped_qpos", "qpos"))
     if hidden == 1:
         return f"torso: height s0, tilt s1\nspeeds s{n}–s{n + 2}, not seen: x"
@@ -92,11 +95,12 @@ def torso_label(body):
 
 
 def project(view, point, size):
-    """Where a point of the world (3,), in metres, lies in a square picture: pixels.
+    """Where a point of the world (3,), metres, lies in a square picture: (2,) pixels.
 
-    `view` holds MuJoCo's two cameras (mjvGLCamera), one for each eye; a flat picture is
-    taken from their middle. A camera is a pinhole; `frustum_near` in front of it stands
-    a window of half height `frustum_top`.
+    The picture's side has `size` pixels. `view` holds MuJoCo's two cameras
+    (mjvGLCamera), one for each eye; a flat picture is taken from their middle. A camera
+    is a pinhole; `frustum_near` in front of it stands a window of half height
+    `frustum_top`.
     """
     one = view[0]
     right = np.cross(one.forward, one.up)
@@ -133,7 +137,10 @@ def label(motors):
 
 
 def spread(wanted, low, high, gap):
-    """Sorted places (N,), moved as little as it takes to stand `gap` apart."""
+    """The wanted places (N,), sorted, moved as little as it takes to stand `gap` apart.
+
+    They lie between `low` and `high`; if there is no room, the first ones below `low`.
+    """
     places = np.clip(np.array(wanted, float), low, high)
     for i in range(1, len(places)):
         places[i] = max(places[i], places[i - 1] + gap)
@@ -174,7 +181,7 @@ def plot_body(picture, joints, ax=None, title=""):
 
 
 def write_bodies(folder):
-    """Photograph and label the four bodies → the paths of the PNG files."""
+    """Photograph and label the four bodies → the PNG files' paths, in `folder`."""
     from PIL import Image
 
     paths = []
@@ -264,7 +271,10 @@ def plot_kept(q, truth, ax=None, title=""):
 
 
 def four_panels(rows=1, height=2.6, title=""):
-    """A figure with a column for each MuJoCo task: (figure, axes (rows, 4))."""
+    """A figure, `height` in inches, with a column for each MuJoCo task.
+
+    Returns (figure, axes (rows, 4)).
+    """
     # Few dots, and no smooth edges where lines are many: a small file
     figure, axes = plt.subplots(rows, 4, figsize=(7.6, height), sharex=True,
                                 squeeze=False, layout="constrained", dpi=72)
@@ -273,7 +283,7 @@ def four_panels(rows=1, height=2.6, title=""):
 
 
 def draw_runs(ax, table, column):
-    """A thin line for each seed, a thick one for their mean; by algorithm."""
+    """A column of a table, by algorithm: each seed thin, their mean thick."""
     for name in ALGORITHMS:
         runs = table[table.algorithm == name]
         if len(runs) == 0:
@@ -291,7 +301,10 @@ def draw_runs(ax, table, column):
 
 
 def finish(figure, axes, tasks, table):
-    """Titles, ticks, one legend; says where nothing is recorded."""
+    """Titles, ticks, one legend below the figure; axes (rows, tasks).
+
+    Where `table` has no row of a task, its panels say so.
+    """
     for ax, task in zip(axes[0], tasks):
         ax.set_title(task, loc="center", fontsize=9)
         if not (table.task == task).any():
@@ -314,7 +327,7 @@ def say_missing(ax):
 
 
 def one_legend(figure, axes):
-    """One legend below all panels; algorithms first, in the book's order."""
+    """One legend below all panels of a figure; algorithms first, in their order."""
     found = {}
     for ax in np.ravel(axes):
         handles, labels = ax.get_legend_handles_labels()
@@ -328,7 +341,7 @@ def one_legend(figure, axes):
 def plot_returns(table, tasks=MUJOCO_TASKS, title=""):
     """Recorded returns, one panel per task: each seed thin, their mean thick.
 
-    table: evaluations from `load_study`, any tasks and algorithms.
+    table: evaluations from `load_study`, any tasks and algorithms. Returns axes (1, 4).
     """
     figure, axes = four_panels(title=title)
     for ax, task in zip(axes[0], tasks):
@@ -341,8 +354,9 @@ def plot_returns(table, tasks=MUJOCO_TASKS, title=""):
 def plot_lag(table, frozen_at=None, tasks=MUJOCO_TASKS, title=""):
     """Bias above, and below it what is owed to lag, on the same scale.
 
-    table: rows of bias from `load_study`, one per run and evaluation. frozen_at: the
-    step after which the actors did not learn any more; drawn grey.
+    table: rows of bias from `load_study`, one per run and evaluation; a panel for each
+    of `tasks`. frozen_at: the step after which the actors did not learn any more; drawn
+    grey.
     """
     figure, axes = four_panels(2, 3.9, title)
     for column, task in zip(axes.T, tasks):

@@ -18,19 +18,18 @@ from dnddpg_minimal.plots.style import (
 )
 
 
-def plot_targets(targets, expected=None, ax=None, title=""):
-    """How simulated targets scatter around the truth, 0: their histogram and mean.
+def plot_y(y, expected=None, ax=None, title=""):
+    """How simulated targets y scatter around the truth, 0: their histogram and mean.
 
-    targets (N,); expected: the closed form of their mean, or None.
+    y (N,); expected: the closed form of their mean, or None.
     """
     if ax is None:
         _, ax = plt.subplots(figsize=(4, 2.9), layout="constrained")
     color = STYLE["DDPG"]["color"]
-    ax.hist(targets, np.linspace(-6, 8, 85), density=True, histtype="stepfilled",
+    ax.hist(y, np.linspace(-6, 8, 85), density=True, histtype="stepfilled",
             color=color, alpha=0.45)  # one shape: quick to draw
     ax.axvline(0, label="truth", **TRUTH)
-    ax.axvline(targets.mean(), color=color, linewidth=2.5,
-               label=f"mean {targets.mean():+.2f}")
+    ax.axvline(y.mean(), color=color, linewidth=2.5, label=f"mean {y.mean():+.2f}")
     if expected is not None:
         ax.axvline(expected, color="black", linestyle=":", linewidth=1.8,
                    label=f"closed form {expected:+.2f}")
@@ -39,16 +38,19 @@ def plot_targets(targets, expected=None, ax=None, title=""):
     return ax
 
 
-def plot_maximum(targets, expected, counts, curves, samples, axes=None, title=""):
+plot_targets = plot_y  # its older name
+
+
+def plot_maximum(y, expected, counts, curves, samples, axes=None, title=""):
     """Eq. 5: how maxima scatter, and their mean against the number of actions.
 
-    targets (N,) and expected as in `plot_targets`. counts (M,); curves: a dict from a
-    label to the closed form (M,); samples: the same labels to simulated means (M,).
+    y (N,) and expected as in `plot_y`. counts (M,); curves: a dict from a label to the
+    closed form (M,); samples: the same labels to simulated means (M,).
     """
     if axes is None:
         figure, axes = plt.subplots(1, 2, figsize=(8, 2.9), layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    plot_targets(targets, expected, axes[0])
+    plot_y(y, expected, axes[0])
     ax = axes[1]
     ax.axhline(0, **TRUTH)
     for (label, values), style in zip(curves.items(), (ONE, TWO, THREE)):

@@ -53,7 +53,7 @@ def legend_below(ax):
 
 
 def note_level(ax, level, text, above=True):
-    """Write above or below a horizontal line, at its right end."""
+    """Write a text above or below a horizontal line at `level`, at its right end."""
     ax.annotate(text, (0.995, level), xycoords=("axes fraction", "data"), ha="right",
                 xytext=(0, 5 if above else -5), textcoords="offset points",
                 va="bottom" if above else "top", fontsize=8.5)
@@ -65,7 +65,10 @@ def thousands(ax):
 
 
 def shrink(picture, factor):
-    """Mean over squares of factor × factor pixels."""
+    """A smaller picture: the mean over squares of factor × factor pixels.
+
+    picture (H, W, 3) uint8 → (H // factor, W // factor, 3) uint8.
+    """
     height, width = (side // factor * factor for side in picture.shape[:2])
     squares = picture[:height, :width].reshape(height // factor, factor,
                                                width // factor, factor, -1)
@@ -73,7 +76,11 @@ def shrink(picture, factor):
 
 
 def draw_map(ax, picture, values, colours, low=None, high=None):
-    """One map over the state plane; its axes are [y, x]."""
+    """One map of values (N, N) over the state plane; its axes are [y, x].
+
+    picture: a dict with the axes x (N,) and y (N,), as of `bias.plane`. colours: the
+    name of a colour map, from `low` to `high`.
+    """
     x, y = picture["x"], picture["y"]
     colours = plt.get_cmap(colours, 25)  # few colours: a small file
     image = ax.imshow(values, origin="lower", aspect="auto", cmap=colours, vmin=low,
@@ -104,6 +111,6 @@ def zero_line(ax):
 
 
 def pale(colour, share=0.65):
-    """The colour, mixed with white."""
+    """The colour, mixed with a share of white: (3,)."""
     rgb = np.array(plt.matplotlib.colors.to_rgb(colour))
     return share + (1 - share) * rgb
