@@ -22,6 +22,7 @@ import time
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated
+from xml.etree import ElementTree
 
 import tyro
 
@@ -143,15 +144,24 @@ def readme_commands():
 
 
 def whole():
-    """Seconds of each part of README's second command, in a fresh clone: a dict."""
+    """Seconds of README's second command in a fresh clone of what is committed.
+
+    A dict: "install", "tests", and "browser", the browser's part of the tests.
+    """
+    make, install, test = readme_commands()
     seconds = {}
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run(["git", "clone", "-q", str(ROOT), folder], check=True)
-        for part in readme_commands():
+        for name, parts in (("install", (make, install)),
+                            ("tests", (f"{test} --junitxml=times.xml",))):
             started = time.time()
-            subprocess.run(shlex.split(part), check=True, cwd=folder,
-                           stdout=sys.stderr)
-            seconds[part] = time.time() - started
+            for part in parts:
+                subprocess.run(shlex.split(part), check=True, cwd=folder,
+                               stdout=sys.stderr)
+            seconds[name] = time.time() - started
+        cases = ElementTree.parse(Path(folder) / "times.xml").iter("testcase")
+        seconds["browser"] = sum(float(case.get("time")) for case in cases
+                                 if "test_browser" in case.get("classname"))
     return seconds
 
 
@@ -170,7 +180,8 @@ def command(chapters: Annotated[tuple[Path, ...], tyro.conf.Positional] = (),
     Args:
         chapters: notebooks; none: every one in `notebooks/`.
         measure: write nothing.
-        readme: time README's second command too, in a fresh clone.
+        readme: time README's second command too, in a fresh clone. The last lines are
+            then the table in README.
     """
     import pandas
 
@@ -191,9 +202,16 @@ def command(chapters: Annotated[tuple[Path, ...], tyro.conf.Positional] = (),
     rows = pandas.DataFrame(rows)
     print(machine())
     print(rows.to_string(index=False, float_format="%.1f", na_rep="-"))
-    print(f"\nChapters: median {rows.seconds.median():.0f} s, longest "
-          f"{rows.seconds.max():.0f} s. Import: {import_seconds():.2f} s beyond "
-          "gymnasium's own.")
-    for part, seconds in whole().items() if readme else ():
-        print(f"{seconds / 60:.1f} min  {part}")
+    table = {"import, s": f"{import_seconds():.2f}",
+             "a chapter, median, s": f"{rows.seconds.median():.0f}",
+             "the longest": f"{rows.seconds.max():.0f}",
+             "first picture, median": f"{rows['to first picture'].median():.0f}",
+             "largest notebook, kB": f"{rows.kB.max():.0f}"}
+    if readme:
+        found = {name: f"{seconds / 60:.0f}" for name, seconds in whole().items()}
+        table |= {"install, min": found["install"], "all tests, min": found["tests"],
+                  "of these the browser's": found["browser"]}
+    print()
+    for line in (table, ["---"] * len(table), table.values()):
+        print(f"| {' | '.join(line)} |")
     return 0

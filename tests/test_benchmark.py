@@ -5,6 +5,8 @@ import pytest
 
 from dnddpg_minimal import ALGORITHMS, Config, NumpyAgent, benchmark
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def rows():

@@ -20,6 +20,8 @@ from dnddpg_minimal import (
 from dnddpg_minimal import bias as instrument
 from dnddpg_minimal.dnddpg import PROBE_TASKS, simulator_state
 
+pytestmark = pytest.mark.slow
+
 EQUATIONS = ["Pendulum-v1", "MountainCarContinuous-v0", "ArmEasy-v0", "ArmHard-v0"]
 MUJOCO = ["HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Humanoid-v5"]
 

@@ -10,6 +10,8 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from dnddpg_minimal import book
 from dnddpg_minimal.__main__ import main
 
+pytestmark = pytest.mark.slow
+
 CHAPTERS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 by_name = pytest.mark.parametrize("path", CHAPTERS, ids=lambda path: path.stem)
 

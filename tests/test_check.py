@@ -12,6 +12,8 @@ from nbclient.exceptions import CellTimeoutError
 from dnddpg_minimal import check
 from dnddpg_minimal.__main__ import main
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 EXERCISE = ROOT / "exercises" / "01_value.ipynb"
 SOLUTION = ROOT / "solutions" / "01_value.ipynb"

@@ -18,6 +18,8 @@ from PIL import Image
 from dnddpg_minimal import Config, NumpyAgent, Training
 from dnddpg_minimal.__main__ import command, main
 
+pytestmark = pytest.mark.slow
+
 SMALL = ["--hidden", "8", "8", "--batch-size", "8", "--warmup", "100"]
 signals = pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT to send")
 

@@ -20,6 +20,8 @@ import pytest
 from dnddpg_minimal import classroom
 from dnddpg_minimal.check import id_of, is_check, read
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 SOLUTIONS = sorted((ROOT / "solutions").glob("*.ipynb"))
 MARKERS = {name: re.compile(f"^ *### BEGIN {name}\n(.*?)^ *### END {name}$",

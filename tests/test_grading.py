@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 GUIDE = (ROOT / "solutions" / "README.md").read_text(encoding="utf-8")
 (WALK,) = (block for block in re.findall(r"^```sh\n(.*?)^```$", GUIDE, re.M | re.S)

@@ -13,6 +13,8 @@ from dnddpg_minimal import plots
 from dnddpg_minimal.dnddpg import MUJOCO_TASKS
 from dnddpg_minimal.plots import mujoco
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(autouse=True)
 def close_figures():

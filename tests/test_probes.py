@@ -9,6 +9,8 @@ import pytest
 
 from dnddpg_minimal import ALGORITHMS, Config, Training, probes
 
+pytestmark = pytest.mark.slow
+
 GAMMA = 0.5
 FAST = dict(hidden=(16, 16), batch_size=32, warmup=100, gamma=GAMMA, tau=0.1,
             critic_lr=5e-3, actor_lr=3e-3, sigma=0.3)

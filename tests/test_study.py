@@ -32,6 +32,8 @@ from dnddpg_minimal import (
     to_env,
 )
 
+pytestmark = pytest.mark.slow
+
 TINY = dict(steps=600, warmup=100, hidden=(16, 16), batch_size=16, evaluate_every=300)
 SPAWN = multiprocessing.get_context("spawn")
 

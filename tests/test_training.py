@@ -26,6 +26,8 @@ from dnddpg_minimal import (
     write_npz,
 )
 
+pytestmark = pytest.mark.slow
+
 SMALL = dict(hidden=(8, 8), batch_size=8)
 PENDULUM = SMALL | dict(task="Pendulum-v1", steps=130, warmup=30, max_episode_steps=20,
                         evaluate_every=25, yield_every=15, seed=3)

@@ -8,6 +8,8 @@ import pytest
 from dnddpg_minimal import Config, widgets
 from dnddpg_minimal.study import load_study
 
+pytestmark = pytest.mark.slow
+
 
 def wait_until(holds, seconds=60):
     end = time.monotonic() + seconds
