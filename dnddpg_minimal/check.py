@@ -66,7 +66,7 @@ def read(path):
 
     try:
         content = json.loads(path.read_bytes())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no notebook, or damaged: {error}") from error
     if not (isinstance(content, dict) and isinstance(content.get("cells"), list)):
         raise ValueError(f"{path} is no notebook: it holds no list of cells")
@@ -106,14 +106,19 @@ def source_of(nb, path):
     """
     numbers = [number_of(id_of(cell)) for cell in nb.cells if id_of(cell)]
     chapter = int(numbers[0].split(".")[0]) if numbers else None
-    if chapter is None and path.name[:2].isdigit():
+    if chapter is None and path.name[:2].isdecimal():
         chapter = int(path.name[:2])
     for solution in (ROOT / "solutions").glob(f"{chapter or 0:02d}_*.ipynb"):
         stripped = path.parent.name == "exercises" and path.name == solution.name
         if numbers or stripped:  # by a program that keeps no metadata
             return read(solution), (f"checks of solutions/{solution.name}, "
                                     "hidden tests included")
-    if not any(is_check(cell) for cell in nb.cells):
+    checks = [cell for cell in nb.cells if is_check(cell)]
+    for cell in checks:
+        points = cell.metadata.nbgrader.get("points")
+        if isinstance(points, bool) or not isinstance(points, int | float):
+            raise ValueError(f"{path} is damaged: {id_of(cell)} has points={points!r}")
+    if not checks:
         raise ValueError(f"{path} holds no exercise with a check")
     return nb, "its own checks (there is no solution of it here)"
 

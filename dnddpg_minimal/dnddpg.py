@@ -654,8 +654,8 @@ class Agent:
             raise ValueError(f"{name} has shape {array.shape}: expected ({width},) or "
                              f"(B, {width}).")
         if not np.isfinite(array).all():
-            raise ValueError(f"{name} holds {array[~np.isfinite(array)][0]!r}: "
-                             "expected finite numbers.")
+            raise ValueError(f"{name} holds {array[~np.isfinite(array)][0]}: expected "
+                             "finite numbers.")
         return array
 
     def _act(self, obs, slow=False):

@@ -8,6 +8,7 @@ A record is one small file: recordings/<task>/<variant>/<algorithm>-<seed>.npz.
 | `score(table, column)` | one number per run: the mean of its last evaluations |
 | `load_agent_at(weights, i)` | an agent from recorded weights |
 | `results(variant)`, `claims(runs)` | the table as measured, and the paper's claims |
+| `predictions(runs)` | the bias that the targets' rules foretell, and as measured |
 | `write_readme(folder)` | the same, put into recordings/README.md |
 """
 
@@ -230,6 +231,42 @@ def claims(runs):
     return found
 
 
+def predictions(runs, folder=None):
+    """What the rule of the target should add to the bias, and what was measured.
+
+    gamma delta / (1 - gamma), with delta as measured (Eq. (5.4)) and as the closed form
+    makes it of sigma, kappa, rho (chapters 05 and 06): each algorithm minus the one
+    before, at the same seeds. `runs` as in `claims`, folder as in `load_study`. One
+    dict per task with known equations and pair; values are means over n seeds.
+    """
+    import pandas as pd
+
+    table = load_study(folder=folder)
+    table = table[~table.task.isin(MUJOCO_TASKS)]  # there is no sigma there
+    rule = Config().target_rule
+    table = table.assign(closed=[
+        0.0 if one.algorithm == "DDPG" else
+        bias.predict(one.sigma, one.kappa, one.rho, rule)
+        for one in table.itertuples()])
+    found = pd.DataFrame({"delta": score(table, "delta"),
+                          "closed": score(table, "closed"), "measured": runs.bias})
+    found, rows = found.dropna().droplevel("variant"), []
+    for task in [one for one in TASKS if one in found.index.levels[0]]:
+        group = found[found.index.get_level_values("task") == task].droplevel("task")
+        grows = bias.accumulated(1.0, Config(task).gamma)
+        group = group.mul([grows, grows, 1.0])  # delta, closed, measured
+        of = {name: one.droplevel("algorithm") for name, one in
+              group.groupby(level="algorithm")}
+        for first, second in (("DCN-DDPG", "DDPG"), ("DN-DDPG", "DCN-DDPG")):
+            if first in of and second in of:
+                d = (of[first] - of[second]).dropna()
+                if len(d) == 0:
+                    continue
+                rows.append(dict(task=task, pair=f"{first} − {second}", n=len(d),
+                                 error=bias.summary(d.measured)[1], **d.mean()))
+    return rows
+
+
 def write_readme(folder=None):
     """Put the tables as measured into recordings/README.md, between its two marks.
 
@@ -260,6 +297,12 @@ def write_readme(folder=None):
         owed = f"{one['owed']:.3g}" if np.isfinite(one["owed"]) else "–"
         text.append("| {claim} | {task} | {mean:.3g} ± {error:.2g} ({n}) | {} | "
                     "{verdict} |".format(owed, **one))
+    heads = ["difference in bias", "task", "γδ/(1−γ), δ measured",
+             "the same, δ from σ, κ, ρ", "measured"]
+    text += ["", row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
+    for one in predictions(runs.xs("class", level="variant", drop_level=False), folder):
+        text.append("| {pair} | {task} | {delta:.3g} | {closed:.3g} | {measured:.3g} ± "
+                    "{error:.2g} ({n}) |".format(**one))
     part = Path(f"{path}.part")
     part.write_text(before + begin + "\n".join(text) + "\n" + end + after,
                     encoding="utf-8", newline="\n")
