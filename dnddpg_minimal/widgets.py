@@ -44,6 +44,11 @@ class Panel(ipywidgets.VBox):
         return f"Panel: {self.title}"
 
 
+# JupyterLab may call two sliders' functions in two threads, and a figure can't be drawn
+# by two.
+DRAWING = threading.RLock()
+
+
 def panel(title, sliders, draw, size=(6.4, 2.9), lines=1, still=()):
     """Sliders (a dict from a name to a widget) above a text and a picture.
 
@@ -63,6 +68,10 @@ def panel(title, sliders, draw, size=(6.4, 2.9), lines=1, still=()):
     drawn = {}  # the rest: the values of `still` it is drawn for, and its pixels
 
     def update(_=None):
+        with DRAWING:
+            draw_again()
+
+    def draw_again():
         values = {name: s.value for name, s in sliders.items()}
         kept = [values[name] for name in still]
         fresh = not still or drawn.get("for") != kept
@@ -585,7 +594,8 @@ class LiveTraining(Panel):
                                        f"noise, returned {record.episode_return:.0f}.")
                 if record.kind == "grid":
                     found.append(bias.evaluate(self.training))
-                    self._draw(found)
+                    with DRAWING:
+                        self._draw(found)
                 while not self._go.wait(0.1):
                     pass
                 if stop.is_set():

@@ -146,6 +146,7 @@ def choose_theme(page, theme):
         page.hover(".lm-Menu-itemLabel:text-is('Theme')")
         page.click(f".lm-Menu-itemLabel:text-is('JupyterLab {theme}')")
         page.wait_for_selector(chosen, state="attached")
+        page.wait_for_selector("#jupyterlab-splash", state="detached")
 
 
 def faults_heard(page):

@@ -1,7 +1,9 @@
 """The panels: what a control does, without a browser."""
 
+import threading
 import time
 
+import ipywidgets
 import numpy as np
 import pytest
 
@@ -40,6 +42,32 @@ def test_the_laboratory_refuses_actors_without_a_critic_of_their_own(rule):
     with pytest.raises(ValueError, match="a critic for each actor"):
         widgets.maximisation_laboratory(rule=rule)
     widgets.maximisation_laboratory(("sigma", "rho"), rule, critics=2, actors=2)
+
+
+def test_two_sliders_moved_from_two_threads_draw_one_after_the_other():
+    inside, most = [], []
+
+    def draw(figure, left, right):
+        inside.append(1)
+        time.sleep(0.02)
+        most.append(len(inside))
+        inside.pop()
+        return f"{left} {right}"
+
+    sliders = {name: ipywidgets.IntSlider() for name in ("left", "right")}
+    panel = widgets.panel("two", sliders, draw)
+
+    def move(slider):
+        for slider.value in range(1, 6):
+            pass
+
+    threads = [threading.Thread(target=move, args=(s,)) for s in sliders.values()]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(most) == 11 and max(most) == 1
+    assert panel.children[2].value == "5 5"
 
 
 def test_every_control_of_the_explorer_changes_text_and_picture():
