@@ -650,7 +650,11 @@ def _start_worker(stop, nice):
 def _work(run, folder, scratch, every):
     gc.collect()  # the last run's replay memory may be 290 MB
     common = Path(folder).is_dir()  # False on a cluster without a common folder
-    what, arrays = record(run, folder, scratch, _stop, every, write=common)
+    try:
+        what, arrays = record(run, folder, scratch, _stop, every, write=common)
+    except OSError as error:  # "No space left on device" doesn't say which device
+        raise OSError(f"{error} (records are written to {folder}, checkpoints to "
+                      f"{scratch or default_scratch()})") from error
     if what == "done" and arrays is None:  # it may lie on this machine only
         arrays = read_npz(Path(folder) / f"{run.name}.npz")
     return what, arrays

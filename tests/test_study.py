@@ -399,6 +399,20 @@ def test_a_run_that_fails_is_named_with_its_reason_and_the_others_go_on(tmp_path
     assert path_of(runs[0], tmp_path).exists()
 
 
+def test_a_run_that_cannot_write_says_where_its_files_lie(tmp_path, runs):
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000, before[1]))  # the worker's too
+    try:
+        failed = study.study(runs[:1], tmp_path, tmp_path / "scratch", workers=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    (why,) = failed.values()
+    assert "File too large" in why
+    assert str(tmp_path) in why and str(tmp_path / "scratch") in why
+    assert not list(tmp_path.rglob("*.npz")) and not list(tmp_path.rglob("*.part"))
+
+
 def test_a_run_that_kills_its_process_is_given_up_after_three_deaths(
         tmp_path, runs, monkeypatch):
     deaths = []
