@@ -253,6 +253,19 @@ def test_every_stub_fails_by_its_own_number_and_the_other_cells_run(solution):
         f"{int(solution.stem[:2])}.{n + 1}" for n in range(len(parts(solution)))]
 
 
+@each_solution
+def test_every_check_is_folded_behind_a_line_that_says_what_it_is(solution):
+    folded = {}
+    for cell in json.loads(exercise_of(solution))["cells"]:
+        grade_id = cell["metadata"].get("nbgrader", {}).get("grade_id", "")
+        if grade_id.startswith("check-"):
+            assert cell["metadata"]["jupyter"] == {"source_hidden": True}
+            folded[classroom.number_of(grade_id)] = cell["source"][0]
+    for number, line in folded.items():
+        assert line.startswith(f"# The check of exercise {number}: ")
+    assert len(folded) == len(parts(solution))
+
+
 # --- What an exercise must not tell ---------------------------------------------------
 
 
