@@ -39,7 +39,6 @@ import math
 import os
 import re
 import warnings
-from collections import defaultdict
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from numbers import Integral, Real
@@ -421,35 +420,30 @@ def join(obs, action=None):
     return x
 
 
-def forward(layers, x, scratch=None):
+def forward(layers, x):
     """x (..., B, in + 1) through N networks: the list [x, h, h, ..., z].
 
-    ReLU after every layer but the last; h (N, B, H + 1), z (N, B, out). `scratch`, a
-    dict, lends the memory for every h again at the next call, which overwrites it.
+    ReLU after every layer but the last; h (N, B, H + 1), z (N, B, out).
     """
-    scratch = {} if scratch is None else scratch
     activations = [x]
-    for i, layer in enumerate(layers[:-1]):
-        key = "h", i, x.shape
-        if key not in scratch:
-            lead = np.broadcast_shapes(x.shape[:-2], layer.shape[:-2])
-            scratch[key] = np.ones((*lead, x.shape[-2], layer.shape[-1] + 1), x.dtype)
-        h = scratch[key]
-        np.matmul(activations[-1], layer, out=h[..., :-1])  # the last column stays 1
+    lead = np.broadcast(x[..., 0, 0], layers[0][..., 0, 0]).shape  # (N,)
+    for layer in layers[:-1]:
+        h = np.empty((*lead, x.shape[-2], layer.shape[-1] + 1), x.dtype)
+        h[..., -1] = 1
+        np.matmul(activations[-1], layer, out=h[..., :-1])
         np.maximum(h, 0, out=h)
         activations.append(h)
     return [*activations, activations[-1] @ layers[-1]]
 
 
-def backward(layers, activations, dz, dlayers=None, inputs=None, scratch=None):
+def backward(layers, activations, dz, dlayers=None, inputs=None):
     """The chain rule from the last layer to the first.
 
     `activations` is what `forward` returned, and `dz` (N, B, out) the loss's gradient
     with respect to z. With `dlayers` the gradients of the layers are written there,
     over what was there. With `inputs`, a slice, the gradient with respect to those
-    columns of x is returned, (N, B, columns). `scratch` lends memory, as in `forward`.
+    columns of x is returned, (N, B, columns).
     """
-    scratch = {} if scratch is None else scratch
     for i in reversed(range(len(layers))):
         layer, x = layers[i], activations[i]
         if dlayers is not None:
@@ -458,9 +452,7 @@ def backward(layers, activations, dz, dlayers=None, inputs=None, scratch=None):
             return None if inputs is None else dz @ layer[:, inputs].swapaxes(-1, -2)
         # With one output the product is an outer product: each number times each.
         product = np.multiply if dz.shape[-1] == 1 else np.matmul
-        key = "dh", i, x.shape
-        dx = product(dz, layer.swapaxes(-1, -2), out=scratch.get(key))
-        scratch[key] = dx
+        dx = product(dz, layer.swapaxes(-1, -2))
         dx *= x > 0  # ReLU passes a gradient where its output is positive
         dz = dx[..., :-1]  # nothing before the column of ones
 
@@ -660,13 +652,13 @@ class Agent:
 
     def _act(self, obs, slow=False):
         layers = self.actor_target if slow else self.actor
-        return np.tanh(self._out(layers, join(obs), "act"))
+        return np.tanh(self._out(layers, join(obs)))
 
     def _q(self, obs, action, slow=False):
         """Every critic at every actor's action (K, B, A): (C, K, B)."""
         layers = self.critic_target if slow else self.critic
         pairs = [layer[:, None] for layer in layers]  # (C, 1, in + 1, out)
-        return self._out(pairs, join(obs, action), "q")[..., 0]
+        return self._out(pairs, join(obs, action))[..., 0]
 
     def td_target(self, batch):
         """y (B,) of a batch, by the config's rule. No gradient flows through it."""
@@ -729,24 +721,19 @@ class NumpyAgent(Agent):
     def _prepare(self):
         self.dtheta = np.zeros_like(self.theta)
         self.dcritic, self.dactor = self.cut(self.dtheta)
-        self.scratch = defaultdict(dict)  # for each use, memory that is used again
 
-    def _out(self, layers, x, use):
-        scratch = self.scratch[use]
-        if len(scratch) > 16:  # too many sizes of B: forget them
-            scratch.clear()
-        return forward(layers, x, scratch)[-1]
+    def _out(self, layers, x):
+        return forward(layers, x)[-1]
 
     def fit_critics(self, batch, y):
         """Critics: down the mean squared error against y (B,), Eq. (3) → losses (C,).
 
         What falls is the sum over critics, so that each learns as if it were alone.
         """
-        size, scratch = len(y), self.scratch["critic"]
-        layers = forward(self.critic, join(batch.obs, batch.action), scratch)
+        size = len(y)
+        layers = forward(self.critic, join(batch.obs, batch.action))
         error = layers[-1][..., 0] - y  # (C, B)
-        dq = (2 / size) * error[..., None]
-        backward(self.critic, layers, dq, self.dcritic, scratch=scratch)
+        backward(self.critic, layers, (2 / size) * error[..., None], self.dcritic)
         self._adam(slice(0, self.split), self.config.critic_lr)
         return (error * error).sum(axis=1) / size
 
@@ -755,16 +742,15 @@ class NumpyAgent(Agent):
 
         Returns the losses (K,): minus the mean of Q.
         """
-        size, scratch = len(batch.obs), self.scratch["actor"]
-        hidden = forward(self.actor, join(batch.obs), scratch)
+        size = len(batch.obs)
+        hidden = forward(self.actor, join(batch.obs))
         action = np.tanh(hidden[-1])  # (K, B, A)
         critic = [layer[self.climbed] for layer in self.critic]
-        layers = forward(critic, join(batch.obs, action), self.scratch["climb"])
+        layers = forward(critic, join(batch.obs, action))
         dq = np.full(layers[-1].shape, -1 / size, self.dtype)  # up is minus down
-        daction = backward(critic, layers, dq, inputs=slice(self.obs_dim, -1),
-                           scratch=self.scratch["climb"])
+        daction = backward(critic, layers, dq, inputs=slice(self.obs_dim, -1))
         daction *= 1 - action * action  # through tanh
-        backward(self.actor, hidden, daction, self.dactor, scratch=scratch)
+        backward(self.actor, hidden, daction, self.dactor)
         self._adam(slice(self.split, None), self.config.actor_lr)
         return layers[-1][..., 0].sum(axis=1) / -size
 
@@ -817,7 +803,7 @@ class TorchAgent(Agent):
             x = self._with_ones((x @ layer).relu())
         return x @ layers[-1]
 
-    def _out(self, layers, x, use):
+    def _out(self, layers, x):
         with self.torch.no_grad():
             return self._numpy(self._forward(layers, self._array(x)))
 
