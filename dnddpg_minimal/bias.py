@@ -16,8 +16,8 @@ MuJoCo, on-policy         the rewards that followed in the same episode  500 or 
 MuJoCo, kept states       the simulator, put back and stepped on         500
 any other task            on-policy only; what is not known is NaN       500 or more
 
-The sum stops at the horizon H, or earlier where gamma^t < 1e-7 (315 steps at 0.95: below
-what float32 can hold). What is left out is at most
+The sum stops at the horizon H, or earlier where gamma^t < 1e-7 (at gamma = 0.95 after
+315 steps: less than float32 can hold). What is left out is at most
 gamma^H * max|reward| / (1 - gamma) (`Measurement.tail`): at gamma = 0.99 and H = 500
 that is 0.7 % of the largest value that is possible.
 
