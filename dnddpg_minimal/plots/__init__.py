@@ -29,7 +29,7 @@ caller, who knows it, passes them.
 | `plot_growth(panels)` | a bias made anew in each target, piling up |
 | `plot_steps(curves, points)` | two actors' steps on a true and a learned Q |
 | `plot_error_and_share(pictures, limit)` | mean error planes, share of seeds above 0 |
-| `plot_owed(table, owed, control, predicted)` | bias, what lag owes, frozen actors |
+| `plot_owed(table, owed, control, debt)` | bias, what lag owes, frozen actors |
 | `plot_along_action(action, cases, added)` | error along the action: offset and slope |
 | `plot_one_backup(x, forms, samples)` | closed forms of one target, and samples |
 | `plot_over_training(table, columns)` | measured quantities over the steps, by seed |

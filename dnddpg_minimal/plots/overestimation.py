@@ -147,14 +147,14 @@ def plot_error_and_share(pictures, limit, axes=None, title=""):
     return axes
 
 
-def plot_owed(table, owed, control, predicted, axes=None, title=""):
+def plot_owed(table, owed, control, debt, axes=None, title=""):
     """Bias during training, what is owed to lag, and a control with a frozen actor.
 
     table: bias of recorded runs, one row per evaluation, any algorithms; each seed of
     DDPG is a thin line. owed: (step (M,), bias (M,)) of DDPG. The scale is linear up to
     ±40 and logarithmic beyond. Right: control, a dict from a label to (updates (N,),
-    bias (S, N)) of S agents, dots on a thin line each; predicted: (updates (M,), bias
-    (M,)) of the frozen ones.
+    bias (S, N)) of S runs, a thin line each; debt: (updates (M,), bias (M,)), what is
+    owed where the actor is frozen.
     """
     if axes is None:
         figure, axes = plt.subplots(1, 2, figsize=(7.2, 2.7), layout="constrained",
@@ -177,12 +177,13 @@ def plot_owed(table, owed, control, predicted, axes=None, title=""):
     ax.legend(loc="upper right", ncols=2)
 
     for (label, (updates, runs)), style in zip(control.items(), (ONE, TWO)):
-        right.plot(updates, np.transpose(runs), "o-", markersize=4, linewidth=0.5,
-                   color=style["color"], markerfacecolor="white")
-        right.plot(updates, np.mean(runs, axis=0), label=label, **style)
-    right.plot(*predicted, label="predicted", color="black", linestyle=":")
-    right.set(xlabel="further updates", xticks=[0, 1_000, 2_000])
-    right.set_ylim(-5, 1.6 * right.get_ylim()[1])  # room for the legend
+        right.plot(updates, np.transpose(runs), linewidth=0.5, color=style["color"])
+        right.plot(updates, np.mean(runs, axis=0), label=label,
+                   **style | {"linewidth": 2.5})
+    right.plot(*debt, label="owed if frozen", color="0.5", linewidth=3,
+               linestyle=(0, (1, 1)))
+    right.set(xlabel="updates after the freeze", xticks=[0, 10_000, 20_000])
+    right.set_ylim(None, 1.6 * right.get_ylim()[1])  # room for the legend
     right.legend(loc="upper right")
     for ax, name in zip(axes, ("training", "control")):
         ax.axhline(0, **TRUTH)
