@@ -286,7 +286,7 @@ def rollout(world, states, policy, gamma, steps=None, first_action=None):
     has ended earns nothing more. One rollout serves two quantities; a dict of (N,):
         truth     discounted sum of up to `steps` rewards; time limits are passed over
         returns   plain sum of the first `world.limit` rewards; on Arm up to success
-        ended     did the world really end?
+        ended     did the world really end, within `world.limit` steps?
         success   Arm: more than 50 steps in a row on the goal, within the limit
         steps_to_goal  Arm: the first step on the goal; the limit where there is none
     and one number, `tail`: the largest truth that can be missing after the horizon.
@@ -315,7 +315,7 @@ def rollout(world, states, policy, gamma, steps=None, first_action=None):
             steps_to_goal[rows] = np.minimum(steps_to_goal[rows], arrival)
             success[rows] |= counter > arm.HOLD
         if terminated.any():
-            ended[rows[terminated]] = True
+            ended[rows[terminated]] = t < limit
             rows, states = rows[~terminated], states[~terminated]
             if len(rows) == 0:
                 break
@@ -664,26 +664,48 @@ def plane(agent, world, x=0, y=1, fixed=None, size=41):
 # ---------------------------------------------------------------------------
 
 
-def owed(updates, values, config):
+def owed(updates, values, config, ends=0.0):
     """The bias that a critic has only because it lags: (M,), with the config's τ and γ.
 
     A part of Q that is constant over the states follows
         dQ/dn = tau (1 - gamma) (V(n) - Q),   Q(0) = 0,
     n the updates of the slow copies. updates (M,) are those of M evaluations (of the
-    online networks), values (M,) the true mean values V measured there. Between two
-    evaluations V is taken as constant. A sketch from above: what is not constant over
-    the states closes faster.
+    online networks), values (M,) the true mean values V measured there.
         owed(n) = - sum over m of exp(-tau (1 - gamma) (n - n_m)) (V_m - V_(m-1))
+    A sketch: what is not constant over the states closes faster, and each jump of V is
+    put at the end of its interval. `ends`, a number or (M,), is the share of the
+    transitions in memory that end the world: they hold no slow Q, so that the mean
+    target has gamma (1 - ends) for gamma.
     """
     n = np.asarray(updates) // config.target_every
-    change = np.diff(np.asarray(values, np.float64), prepend=0.0)
-    rate = config.tau * (1 - config.gamma)
-    out, debt, last = [], 0.0, 0
-    for now, jump in zip(n, change, strict=True):
-        debt = debt * np.exp(-rate * (now - last)) - jump
-        out.append(debt)
-        last = now
-    return np.array(out)
+    debts, debt = [], 0.0
+    jumps = np.diff(np.asarray(values, np.float64), prepend=0.0)
+    for jump, kept in zip(jumps, _kept(n, config, ends), strict=True):
+        debt = debt * kept - jump
+        debts.append(debt)
+    return np.array(debts)
+
+
+def grown(updates, delta, config, ends=0.0):
+    """What a bias delta, made anew in each target, has grown to: (M,).
+
+        dB/dn = tau (1 - gamma) (gamma delta / (1 - gamma) - B),   B(0) = 0
+    delta (M,) is what was measured at these updates (M,); `ends` as in `owed`. After
+    many updates with one delta it is `accumulated(delta, gamma, ends)`.
+    """
+    n = np.asarray(updates) // config.target_every
+    limits = accumulated(np.asarray(delta, np.float64), config.gamma, ends)
+    found, now = [], 0.0
+    for limit, kept in zip(limits, _kept(n, config, ends), strict=True):
+        now = now * kept + limit * (1 - kept)
+        found.append(now)
+    return np.array(found)
+
+
+def _kept(n, config, ends):
+    """How much of a constant part of Q is left from one evaluation to the next: (M,)"""
+    rate = config.tau * (1 - config.gamma * (1 - np.asarray(ends)))
+    return np.exp(-rate * np.diff(n, prepend=0))
 
 
 def take_apart(agent, world, states):
@@ -824,6 +846,11 @@ def predict(sigma, kappa, rho, rule, nu=0.1):
     return float(sigma * forms[rule]())
 
 
-def accumulated(delta, gamma):
-    """A bias delta made anew in each target grows to gamma delta / (1 - gamma)."""
+def accumulated(delta, gamma, ends=0.0):
+    """A bias delta made anew in each target grows to gamma delta / (1 - gamma).
+
+    `ends` is the share of transitions that end the world; gamma (1 - ends) stands for
+    gamma then.
+    """
+    gamma = gamma * (1 - ends)
     return gamma * delta / (1 - gamma)

@@ -7,6 +7,7 @@ A record is one small file: recordings/<task>/<variant>/<algorithm>-<seed>.npz.
 | `load_study(task, algorithm, ...)` | what was recorded, as tables and arrays |
 | `score(table, column)` | one number per run: the mean of its last evaluations |
 | `load_agent_at(weights, i)` | an agent from recorded weights |
+| `owed(columns, config, ends)` | what each row of bias owes to lag alone |
 | `results(variant)`, `claims(runs)` | the table as measured, and the paper's claims |
 | `predictions(runs)` | the bias that the targets' rules foretell, and as measured |
 | `write_readme(folder)` | the same, put into recordings/README.md |
@@ -15,7 +16,9 @@ A record is one small file: recordings/<task>/<variant>/<algorithm>-<seed>.npz.
 import json
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
+import gymnasium
 import numpy as np
 
 from dnddpg_minimal import bias
@@ -50,7 +53,9 @@ def load_study(task=None, algorithm=None, variant="class", what="evaluations",
 
     what="evaluations", "bias": one pandas DataFrame. A bias is that of the policy that
     acts; `rule="max_min"` or `"paired"` asks for that of the policy that chooses its
-    action so (measured for two actors on Pendulum, MountainCar and the Arms).
+    action so (measured for two actors on Pendulum, MountainCar and the Arms). `owed` is
+    computed here, so that old and new records have the same; `ends` is the share of the
+    transitions in memory that end the world.
     Anything else: a list of dicts, one per run, with task, algorithm, variant, seed and
 
         episodes  step, length, episode_return                         (E,)
@@ -101,13 +106,16 @@ def _read(path, what, rule):
             names, labels = meta[f"{what}_numbers"], meta[f"{what}_labels"]
             if not names:
                 return []
-            table = content[what].astype(np.float64)
+            columns = dict(zip(names, content[what].astype(np.float64).T, strict=True))
+            columns["ends"] = share_of_ends(content["episodes"], columns["step"],
+                                            config, meta["bug"])
             rows = slice(None)
             if labels:
-                words = content[f"{what}_labels"]
-                rows = words[:, labels.index("rule")] == (rule or config["act_rule"])
-                one |= dict(zip(labels, words[rows].T, strict=True))
-            one |= dict(zip(names, table[rows].T, strict=True))
+                words = content[f"{what}_labels"].T
+                columns |= dict(zip(labels, words, strict=True))
+                columns["owed"] = owed(columns, config, columns["ends"])
+                rows = columns["rule"] == (rule or config["act_rule"])
+            one |= {name: column[rows] for name, column in columns.items()}
         elif what == "episodes":
             step, length, total = content["episodes"].T
             one |= dict(step=step.astype(int), length=length.astype(int),
@@ -129,6 +137,44 @@ def _read(path, what, rule):
         else:
             return []
     return [one]
+
+
+def share_of_ends(episodes, steps, config, bug=None):
+    """The share of the transitions in memory that were stored as the world's end: (M,).
+
+    episodes (E, 3): step, length, return of each; steps (M,) ask; config: a dict of
+    its fields. An episode that is shorter than its time limit has ended, on the Arms
+    only with `success_terminates`; `ends` and `bug` may store something else.
+    """
+    limit = (config["max_episode_steps"]
+             or gymnasium.spec(config["task"]).max_episode_steps or np.inf)
+    ended = episodes[:, 1] < limit
+    if config["task"].startswith("Arm"):
+        ended &= (config["task_options"] or {}).get("success_terminates", False)
+    if config["ends"] == "none" or bug == "no_end":
+        ended[:] = False
+    elif config["ends"] == "any_end" or bug == "time_limit":
+        ended[:] = True
+    count = np.searchsorted(episodes[ended, 0], steps, side="right")
+    return count / np.maximum(steps, 1)
+
+
+def owed(columns, config, ends):
+    """What each row of a run's bias owes to lag alone (`bias.owed`): (M,).
+
+    columns: a dict of arrays (M,), the columns of the table; config: a dict of its
+    fields; ends (M,) of `share_of_ends`. V is the truth over start states (on MuJoCo
+    over on-policy states) for the policy that acts: all rows of one evaluation are
+    about one critic. NaN where V was not measured.
+    """
+    series = ((columns["rule"] == config["act_rule"]) & (columns["critic"] == "min")
+              & (columns["action"] == "policy") & np.isfinite(columns["truth"])
+              & np.isin(columns["states"], ("start", "on_policy")))
+    updates = columns["updates"]
+    found = bias.owed(updates[series], columns["truth"][series],
+                      SimpleNamespace(**config), ends[series])
+    known = dict(zip(updates[series].tolist(), found.tolist(), strict=True))
+    return np.array([known.get(n, np.nan) for n in updates.tolist()])
 
 
 def _frame(found):
@@ -176,33 +222,39 @@ def load_agent_at(weights, i=-1):
 # --- 2. The table as measured ---------------------------------------------------------
 
 
-def results(variant="class", folder=None):
+def results(variant="class", folder=None, until=np.inf):
     """Return and bias of every task and algorithm: mean, standard error, n of runs.
 
-    variant, folder: as in `load_study`.
+    variant, folder: as in `load_study`; `until` leaves out what came after this step.
 
     Each run counts by its `score`. The bias is the first critic's, at the policy's
-    action: over start states, on MuJoCo over on-policy states. A DataFrame over (task,
-    variant, algorithm); "return", "bias" and "owed" hold (mean, error, n).
+    action: over start states, on MuJoCo over on-policy states. Two DataFrames, the
+    runs' and their summary over (task, variant, algorithm); "steps" is a run's length,
+    "return", "bias" and "owed" hold (mean, error, n).
     """
     import pandas as pd
 
-    returns = score(load_study(variant=variant, folder=folder))
+    table = load_study(variant=variant, folder=folder)
+    table = table[table.step <= until]
     rows = load_study(variant=variant, what="bias", folder=folder)
-    rows = rows[(rows.action == "policy") & (rows.critic == "0")
-                & rows.states.isin(("start", "on_policy"))]
-    runs = pd.DataFrame({"return": returns, "bias": score(rows, "bias"),
-                         "owed": score(rows, "owed")})
-    return runs, runs.groupby(["task", "variant", "algorithm"], sort=False).agg(
-        bias.summary)
+    rows = rows[(rows.action == "policy") & (rows.critic == "0") & (rows.step <= until)]
+    starts = rows[rows.states.isin(("start", "on_policy"))]
+    runs = pd.DataFrame({
+        "return": score(table), "bias": score(starts, "bias"),
+        "owed": score(starts, "owed"),
+        "recent": score(rows[rows.states == "recent"], "bias"),
+        "steps": table.groupby([*RUN], sort=False)["step"].max()})
+    by = runs.groupby(["task", "variant", "algorithm"], sort=False)
+    summary = by[["return", "bias", "owed"]].agg(bias.summary)
+    return runs, summary.assign(steps=by["steps"].max())
 
 
 def claims(runs):
     """What the paper says, against the runs of `results`: one row per task and claim.
 
     Differences are paired by seed; a verdict needs three of them, and a 95 % t interval
-    on one side of 0. `owed` is the part of a bias that a critic's lag alone explains: a
-    bias that holds and is no larger than that is said to be so.
+    on one side of 0. `owed` is the part of a bias that a critic's lag alone explains;
+    `beyond` is the verdict on the bias minus what its own run owes.
     """
     from dnddpg_minimal.statistics import verdict
 
@@ -222,22 +274,24 @@ def claims(runs):
         owed = difference("owed")
         for task, group in difference(what).dropna().groupby(level="task", sort=False):
             mean, error, n = bias.summary(group)
-            lag = owed.reindex(group.index).mean() if what == "bias" else np.nan
-            words = verdict(group)
-            if words == "holds" and lag >= mean:
-                words = "holds, and is no more than what is owed to lag"
+            lag, beyond = np.nan, ""
+            if what == "bias":
+                lag = owed.reindex(group.index).mean()
+                beyond = verdict((group - owed.reindex(group.index)).dropna())
             found.append(dict(task=task, claim=claim, mean=mean, error=error, n=n,
-                              owed=lag, verdict=words))
+                              owed=lag, verdict=verdict(group), beyond=beyond))
     return found
 
 
 def predictions(runs, folder=None):
     """What the rule of the target should add to the bias, and what was measured.
 
-    gamma delta / (1 - gamma), with delta as measured (Eq. (5.4)) and as the closed form
-    makes it of sigma, kappa, rho (chapters 05 and 06): each algorithm minus the one
-    before, at the same seeds. `runs` as in `claims`, folder as in `load_study`. One
-    dict per task with known equations and pair; values are means over n seeds.
+    `bias.grown` of delta, as measured (Eq. (5.4)) and as the closed form makes it of
+    sigma, kappa, rho (chapters 05 and 06): each algorithm minus the one before, at the
+    same seeds. delta is measured at states from memory, so the bias there is compared
+    ("recent"), and that at start states stands beside it. `runs` as in `claims`, folder
+    as in `load_study`. One dict per task with known equations and pair; values are
+    means over n seeds.
     """
     import pandas as pd
 
@@ -248,13 +302,18 @@ def predictions(runs, folder=None):
         0.0 if one.algorithm == "DDPG" else
         bias.predict(one.sigma, one.kappa, one.rho, rule)
         for one in table.itertuples()])
+    grown = []
+    for (task, *_), one in table.groupby([*RUN], sort=False):
+        columns = {name: bias.grown(one.updates, one[name], Config(task), one.ends)
+                   for name in ("delta", "closed")}
+        grown.append(one.assign(**columns))
+    table = pd.concat(grown) if grown else table
     found = pd.DataFrame({"delta": score(table, "delta"),
-                          "closed": score(table, "closed"), "measured": runs.bias})
+                          "closed": score(table, "closed"),
+                          "start": runs.bias, "recent": runs.recent})
     found, rows = found.dropna().droplevel("variant"), []
     for task in [one for one in TASKS if one in found.index.levels[0]]:
         group = found[found.index.get_level_values("task") == task].droplevel("task")
-        grows = bias.accumulated(1.0, Config(task).gamma)
-        group = group.mul([grows, grows, 1.0])  # delta, closed, measured
         of = {name: one.droplevel("algorithm") for name, one in
               group.groupby(level="algorithm")}
         for first, second in (("DCN-DDPG", "DDPG"), ("DN-DDPG", "DCN-DDPG")):
@@ -262,8 +321,10 @@ def predictions(runs, folder=None):
                 d = (of[first] - of[second]).dropna()
                 if len(d) == 0:
                     continue
+                errors = {f"{name}_error": bias.summary(d[name])[1]
+                          for name in ("recent", "start")}
                 rows.append(dict(task=task, pair=f"{first} − {second}", n=len(d),
-                                 error=bias.summary(d.measured)[1], **d.mean()))
+                                 **errors, **d.mean()))
     return rows
 
 
@@ -283,26 +344,47 @@ def write_readme(folder=None):
         raise ValueError(f"{path.parent} holds no record yet: there is nothing to put "
                          "into the tables.")
     runs, table = results(None, folder)
-    text = [f"{len(runs)} runs. Each number: mean ± standard error (number of runs).\n"]
+    text = [f"{len(runs)} runs. Each number: mean ± standard error (number of runs). A "
+            "run counts by the mean of its last ten evaluations, on MuJoCo five. What "
+            "has fewer steps than `class` stands beside `class` cut at these steps.\n"]
     row = "| {} |".format
-    heads = ["task", "variant", "algorithm", "return", "bias of Q", "owed to lag"]
+    heads = ["task", "variant", "steps", "algorithm", "return", "bias of Q",
+             "owed to lag"]
     text += [row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
-    for names, values in table.iterrows():
+    lines = [(names, values) for names, values in table.iterrows()]
+    full = table.steps.groupby(level=["task", "variant"]).max()
+    shorter = {(task, steps) for (task, _), steps in full.items()
+               if steps < full.get((task, "class"), 0)}
+    for task, steps in shorter:
+        early = results("class", folder, steps)[1].xs(task, drop_level=False)
+        lines += [((task, f"class, until step {steps:.0f}", name[2]), values)
+                  for name, values in early.iterrows()]
+    lines.sort(key=lambda line: _order(line[0][0], line[0][2], line[0][1], 0)[:4])
+    for (task, variant, algorithm), values in lines:
         cells = ["{:.4g} ± {:.2g} ({})".format(*value) if value[2] > 1 else
-                 "{:.4g} (1)".format(*value) for value in values]
-        text.append(row(" | ".join([*names, *cells])))
-    heads = ["claim", "task", "difference", "owed to lag", "verdict"]
+                 "{:.4g} (1)".format(*value) for value in values[:3]]
+        text.append(row(" | ".join([task, variant, f"{values.steps:.0f}", algorithm,
+                                    *cells])))
+    heads = ["claim", "task", "difference", "owed to lag", "verdict",
+             "verdict beyond lag"]
     text += ["", row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
-    for one in claims(runs.xs("class", level="variant", drop_level=False)):
+    of_class = runs.xs("class", level="variant", drop_level=False)
+    found = claims(of_class)
+    for one in found:
         owed = f"{one['owed']:.3g}" if np.isfinite(one["owed"]) else "–"
         text.append("| {claim} | {task} | {mean:.3g} ± {error:.2g} ({n}) | {} | "
-                    "{verdict} |".format(owed, **one))
-    heads = ["difference in bias", "task", "γδ/(1−γ), δ measured",
-             "the same, δ from σ, κ, ρ", "measured"]
+                    "{verdict} | {beyond} |".format(owed, **one))
+    many = sum(one["n"] > 2 for one in found)
+    text += ["", f"{many} verdicts at 95 %: by chance alone {many / 20:.1f} would "
+             "leave 0 out."]
+    heads = ["difference in bias", "task", "grown from δ as measured",
+             "grown from σ, κ, ρ", "measured, states from memory",
+             "measured, start states"]
     text += ["", row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
-    for one in predictions(runs.xs("class", level="variant", drop_level=False), folder):
-        text.append("| {pair} | {task} | {delta:.3g} | {closed:.3g} | {measured:.3g} ± "
-                    "{error:.2g} ({n}) |".format(**one))
+    for one in predictions(of_class, folder):
+        text.append("| {pair} | {task} | {delta:.3g} | {closed:.3g} | {recent:.3g} ± "
+                    "{recent_error:.2g} ({n}) | {start:.3g} ± {start_error:.2g} ({n}) |"
+                    .format(**one))
     part = Path(f"{path}.part")
     part.write_text(before + begin + "\n".join(text) + "\n" + end + after,
                     encoding="utf-8", newline="\n")

@@ -80,6 +80,9 @@ def scores(table, kind="end", column="mean"):
     elif kind == "maximum":
         found = groups.max()
     elif kind == "spread":
+        # Among the seeds that all algorithms have: a median of more runs lies farther.
+        seeds = table.groupby(["task", "seed"])["algorithm"].transform("nunique")
+        table = table[seeds == seeds.groupby(table["task"]).transform("max")]
         middle = table.groupby(["task", "algorithm", "step"])[column]
         away = (table[column] - middle.transform("median")).abs()
         found = away.groupby([table[name] for name in runs]).mean()

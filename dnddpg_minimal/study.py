@@ -70,7 +70,9 @@ from dnddpg_minimal.records import (
     TASKS,
     load_agent_at,
     load_study,
+    owed,
     score,
+    share_of_ends,
     write_readme,
 )
 
@@ -340,16 +342,17 @@ def finish(run, training, notes):
     `meta` says what is what.
     """
     config, agent = run.config, training.agent
-    owed_to(notes.bias, config)
-    episodes = [(r.step, r.length, r.episode_return) for r in training.records
-                if r.kind == "episode"]
+    episodes = np.float32([(r.step, r.length, r.episode_return)
+                           for r in training.records if r.kind == "episode"])
+    episodes = episodes.reshape(-1, 3)
+    owed_to(notes.bias, asdict(config), episodes, run.bug)
     meta = dict(format=FORMAT, variant=run.variant, bug=run.bug, config=asdict(config),
                 obs_dim=agent.obs_dim, action_dim=agent.action_dim,
                 steps=training.step, updates=training.updates, probe=notes.probe,
                 seconds=round(notes.seconds, 1), versions=versions(),
                 processor=processor(), blas=blas(), revision=revision(), code=code())
     arrays = dict(first_losses=np.float32(training.first_losses),
-                  episodes=np.float32(episodes).reshape(-1, 3))
+                  episodes=episodes)
     for name, rows in (("evaluations", notes.evaluations), ("bias", notes.bias)):
         names = list(rows[0]) if rows else []
         labels = [n for n in names if isinstance(rows[0][n], str)]
@@ -368,28 +371,14 @@ def finish(run, training, notes):
     return dict(meta=json.dumps(meta), **arrays)
 
 
-def owed_to(rows, config):
-    """Add to each row of bias what is owed to lag alone (bias.owed), in place.
-
-    V is the truth at the policy's action, over the same kind of states. What is not
-    measured at every evaluation borrows V: the other rule's from the rule that acts,
-    that of MuJoCo's kept states from the on-policy states.
-    """
-    series = {}  # (rule, states): {updates: truth}
-    for row in rows:
-        if row["action"] == "policy" and row["critic"] == "min":
-            known = series.setdefault((row["rule"], row["states"]), {})
-            if np.isfinite(row["truth"]):
-                known[row["updates"]] = row["truth"]
-    found = {}
-    for rule, states in series:
-        acts = config.act_rule
-        candidates = (rule, states), (acts, states), (acts, "on_policy")
-        values = max((series.get(kind, {}) for kind in candidates), key=len)
-        owed = bias.owed(np.array([*values]), np.array([*values.values()]), config)
-        found[rule, states] = dict(zip(values, owed.tolist(), strict=True))
-    for row in rows:
-        row["owed"] = found[row["rule"], row["states"]].get(row["updates"], np.nan)
+def owed_to(rows, config, episodes, bug=None):
+    """Add to each row of bias what is owed to lag alone (records.owed), in place."""
+    columns = {name: np.array([row[name] for row in rows]) for name in
+               ("rule", "states", "action", "critic", "step", "updates", "truth")}
+    if rows:
+        ends = share_of_ends(episodes, columns["step"], config, bug)
+        for row, lag in zip(rows, owed(columns, config, ends).tolist(), strict=True):
+            row["owed"] = lag
 
 
 def visits(task, replay):

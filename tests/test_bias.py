@@ -630,6 +630,27 @@ def test_the_operators_numbers_are_found_in_planted_errors():
     assert found["n"] == n
 
 
+def test_a_delta_grows_and_a_debt_shrinks_by_the_targets_that_hold_a_slow_q():
+    # A table of 1 000 transitions that all hold one number: 50 of them end the world.
+    config, ends, delta = Config("Pendulum-v1", tau=0.05, gamma=0.9), 0.05, -0.3
+    terminated = np.arange(1_000) < 50
+    updates, offset, late = np.array([0, 400, 900]), 0.0, -7.0
+    expected = [(offset, late)]
+    for n in range(1, 901):
+        for_each = np.where(terminated, 0, 0.9 * (offset + delta))  # of its target
+        offset += 0.05 * (for_each.mean() - offset)
+        late += 0.05 * (np.where(terminated, 0, 0.9 * late).mean() - late)
+        if n in updates:
+            expected.append((offset, late))
+    grown = instrument.grown(updates, [delta] * 3, config, ends)
+    owed = instrument.owed(updates, [7.0] * 3, config, ends)  # V_1 = 7, Q = 0
+    assert np.allclose(grown, np.transpose(expected)[0], rtol=0.02)
+    assert np.allclose(owed, np.transpose(expected)[1], rtol=0.02, atol=0.01)
+    limit = instrument.accumulated(delta, 0.9, ends)
+    assert np.isclose(grown[-1], limit, rtol=1e-2)
+    assert abs(limit) < abs(instrument.accumulated(delta, 0.9))
+
+
 def test_owed_is_what_dq_dn_leaves_behind():
     config = Config("Pendulum-v1", tau=0.05, gamma=0.9, target_every=3)
     updates = np.array([0, 600, 1500, 1501, 9000])

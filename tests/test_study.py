@@ -1,11 +1,13 @@
 """The recorded study: it loses nothing, doubles nothing, and repeats itself exactly."""
 
+import dataclasses
 import errno
 import itertools
 import json
 import multiprocessing
 import os
 import pickle
+import re
 import shutil
 import signal
 import subprocess
@@ -184,16 +186,31 @@ def test_owed_is_that_of_the_runs_own_values(undisturbed, runs):
     assert one.owed.iloc[0] == -one.truth.iloc[0] > 0  # at first all of V is owed
 
 
-def test_sparse_measurements_borrow_the_values_of_dense_ones():
+def test_all_rows_of_one_evaluation_owe_the_same():
     config = Config("HalfCheetah-v5", "DDPG")
     common = dict(rule="paired", action="policy", critic="min")
-    rows = [common | dict(states="on_policy", updates=n, truth=float(n)) for n in
-            (1_000, 2_000, 3_000)]
-    rows.append(common | dict(states="recent", updates=2_000, truth=5_000.0))
-    rows.append(common | dict(states="recent", updates=2_000, truth=np.nan,
-                              action="replay"))
-    study.owed_to(rows, config)
-    assert rows[3]["owed"] == rows[4]["owed"] == rows[1]["owed"]
+    rows = [common | dict(states="on_policy", updates=n, step=n, truth=float(n))
+            for n in (1_000, 2_000, 3_000)]
+    rows.append(common | dict(states="recent", updates=2_000, step=2_000, truth=5e3))
+    rows.append(rows[-1] | dict(truth=np.nan, action="replay", critic="0"))
+    study.owed_to(rows, dataclasses.asdict(config), np.zeros((0, 3)))
+    expected = bias.owed([1_000, 2_000, 3_000], [1e3, 2e3, 3e3], config)
+    assert [row["owed"] for row in rows] == [*expected, expected[1], expected[1]]
+
+
+def test_the_share_of_ends_counts_what_was_stored_as_an_end():
+    steps, episodes = [500, 1_000, 2_000], np.array([[400, 400, 1], [1_400, 1_000, 1],
+                                                     [1_900, 500, 1]])
+
+    def share(bug=None, **choices):
+        config = dataclasses.asdict(Config(**dict(task="Hopper-v5") | choices))
+        return study.share_of_ends(episodes, steps, config, bug).tolist()
+
+    assert share() == [1 / 500, 1 / 1_000, 2 / 2_000]
+    assert share(ends="none") == share("no_end") == [0, 0, 0]
+    assert share(ends="any_end") == share("time_limit") == [1 / 500, 1 / 1_000,
+                                                            3 / 2_000]
+    assert share(task="ArmEasy-v0") == [0, 0, 0]  # success is a truncation there
 
 
 def test_episodes_losses_and_versions_are_recorded(undisturbed, runs):
@@ -680,7 +697,8 @@ def test_the_readme_gets_its_tables_and_keeps_its_words(tmp_path, monkeypatch):
     assert study.main(["--readme", "--folder", str(tmp_path)]) == 0
     once = (tmp_path / "README.md").read_text(encoding="utf-8")
     assert once.startswith(before[:before.index("<!-- measured -->")])
-    assert "| Pendulum-v1 | class | DN-DDPG | " in once and "± " in once
+    assert re.search(r"\| Pendulum-v1 \| class \| \d+ \| DN-DDPG \| ", once)
+    assert "± " in once
     assert "| bias: DDPG > 0 | Pendulum-v1 | " in once
     records.write_readme(tmp_path)
     assert (tmp_path / "README.md").read_text(encoding="utf-8") == once
