@@ -331,7 +331,8 @@ def test_an_exercise_holds_no_outputs_and_no_other_metadata(solution):
     exercise = json.loads(exercise_of(solution))
     assert exercise["metadata"].keys() == {"kernelspec", "language_info"}
     for cell in exercise["cells"]:
-        assert cell["metadata"].keys() <= {"nbgrader", "deletable", "editable"}
+        assert cell["metadata"].keys() <= {"nbgrader", "deletable", "editable",
+                                           "jupyter"}
         assert cell.get("outputs", []) == [] and cell.get("execution_count") is None
 
 
