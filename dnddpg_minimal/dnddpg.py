@@ -426,7 +426,7 @@ def forward(layers, x):
     ReLU after every layer but the last; h (N, B, H + 1), z (N, B, out).
     """
     activations = [x]
-    lead = np.broadcast(x[..., 0, 0], layers[0][..., 0, 0]).shape  # (N,)
+    lead = np.broadcast(x[..., :1, 0], layers[0][..., :1, 0]).shape[:-1]  # (N,)
     for layer in layers[:-1]:
         h = np.empty((*lead, x.shape[-2], layer.shape[-1] + 1), x.dtype)
         h[..., -1] = 1

@@ -607,6 +607,15 @@ def test_one_observation_gets_the_action_that_it_gets_in_a_batch(kind):
 
 
 @AGENTS
+def test_no_state_has_no_action_and_no_q(kind):
+    agent = kind(Config("Pendulum-v1"), 3, 1)  # 2 critics, 2 actors
+    none = np.zeros((0, 3))
+    assert agent.act(none).shape == (0, 1)
+    assert agent.q_values(none, np.zeros((0, 1))).shape == (2, 0)
+    assert agent.q_next(none).shape == (2, 2, 0)
+
+
+@AGENTS
 def test_actions_stay_within_minus_one_and_one(kind):
     agent = tiny_agent(kind)
     assert abs(agent.actions(1e4 * random_batch(50).obs)).max() <= 1
