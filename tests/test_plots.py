@@ -7,6 +7,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 import pytest
 
 from dnddpg_minimal import ALGORITHMS, Record, plots
@@ -97,3 +98,12 @@ def test_a_figure_can_be_drawn_into_axes_of_ones_own(picture):
     assert plots.plot_error_plane(picture, axes=axes) is axes
     assert plots.plot_truth(picture, ax=axes[0]) is axes[0]
     assert plt.get_fignums() == [figure.number]
+
+
+def test_every_group_of_runs_is_drawn_in_a_colour_of_its_own():
+    runs = pd.DataFrame({"algorithm": ["DDPG"], "bias": [1.0], "mean": [2.0]})
+    ax = plots.plot_bias_and_return({f"group {n}": runs for n in range(6)})
+    marks = [line for line in ax.lines if len(line.get_xdata()) == 1]
+    assert len({line.get_markeredgecolor() for line in marks}) == len(marks) == 6
+    with pytest.raises(ValueError, match="7 groups: expected 6 at the most"):
+        plots.plot_bias_and_return({f"group {n}": runs for n in range(7)})

@@ -194,7 +194,9 @@ def plot_bias_and_return(groups, ax=None, title=""):
     if ax is None:
         _, ax = plt.subplots(figsize=(7, 3.2), layout="constrained")
     ax.axvline(0, **TRUTH)
-    colours = ("#000000", "#E69F00", "#56B4E9", "#CC79A7")
+    colours = ("#000000", "#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#D55E00")
+    if len(groups) > len(colours):
+        raise ValueError(f"{len(groups)} groups: expected {len(colours)} at the most.")
     for (label, runs), colour in zip(groups.items(), colours):
         for name, of_name in runs.groupby("algorithm", sort=False):
             ax.plot(of_name["bias"], of_name["mean"], MARKERS[name], markersize=7,
