@@ -721,8 +721,12 @@ def test_a_claim_needs_an_interval_on_one_side_of_zero():
         "bias: DN > DCN": "holds"}
     runs["owed"] = np.repeat([-9.0, -5.0, 0.0], 5)  # all of it is lag
     verdicts = {one["claim"]: one["verdict"] for one in records.claims(runs)}
-    assert verdicts["bias: DCN < 0"] == "holds, and is no more than what is owed to lag"
-    assert verdicts["return: DN > DCN"] == "holds"
+    assert verdicts["bias: DCN < 0"] == verdicts["return: DN > DCN"] == "holds"
+    beyond = {one["claim"]: one["beyond"] for one in records.claims(runs)}
+    assert beyond == {
+        "return: DN > DDPG": "", "return: DN > DCN": "",
+        "bias: DDPG > 0": "not distinguishable", "bias: DCN < 0": "not distinguishable",
+        "bias: DN > DCN": "not distinguishable"}
 
 
 # --- ablations and bugs ---------------------------------------------------------------

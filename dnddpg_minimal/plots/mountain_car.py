@@ -189,7 +189,8 @@ def plot_bias_and_return(groups, ax=None, title=""):
 
     groups: a dict from a label to a DataFrame with the columns algorithm, bias and
     mean (return), one row per run. The marker's shape is the algorithm, its colour the
-    group. Bias is linear up to ±1 and logarithmic beyond.
+    group. Bias is linear up to ±1 and logarithmic beyond. ValueError for more groups
+    than there are colours.
     """
     if ax is None:
         _, ax = plt.subplots(figsize=(7, 3.2), layout="constrained")
