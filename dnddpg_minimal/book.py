@@ -111,7 +111,8 @@ def measured(path):
     """
     started = time.time()
     notebook = run_chapter(path)
-    row = {"chapter": Path(path).stem, "seconds": time.time() - started}
+    row = {"chapter": Path(path).stem, "seconds": time.time() - started,
+           "to first picture": float("nan")}  # a notebook may show none
     shown = (cell for cell in notebook.cells if pictures({"cells": [cell]}))
     first = next(shown, None)
     if first is not None:
