@@ -142,6 +142,7 @@ def _read(path, what, rule):
 def share_of_ends(episodes, steps, config, bug=None):
     """The share of the transitions in memory that were stored as the world's end: (M,).
 
+    Of all transitions so far: the memory holds them all until it is full.
     episodes (E, 3): step, length, return of each; steps (M,) ask; config: a dict of
     its fields. An episode that is shorter than its time limit has ended, on the Arms
     only with `success_terminates`; `ends` and `bug` may store something else.

@@ -778,3 +778,16 @@ def test_a_summary_says_mean_standard_error_and_n():
     assert error == pytest.approx(np.std([1, 2, 3, 6], ddof=1) / 2)
     assert np.isnan(instrument.summary([])[0]) and instrument.summary([])[2] == 0
     assert np.isnan(instrument.summary([1.0])[1])
+
+
+@pytest.mark.parametrize("limit, in_time", [(50, False), (200, True)])
+def test_a_flag_after_the_time_limit_is_in_the_truth_and_no_success(limit, in_time):
+    config = Config("MountainCarContinuous-v0", max_episode_steps=limit)
+
+    def along_the_velocity(obs):  # the flag after about 106 steps
+        return np.where(obs[:, 1:] < 0, -1.0, 1.0)
+
+    found = instrument.rollout(instrument.dynamics(config), np.array([[-0.5, 0.0]]),
+                               along_the_velocity, gamma=0.99)
+    assert found["truth"][0] > 20
+    assert found["ended"].tolist() == [in_time]
