@@ -53,7 +53,6 @@ from .dnddpg import (
     is_mujoco,
     make_env,
     stream,
-    td_target,
     to_env,
 )
 
@@ -430,8 +429,9 @@ def bias_rows(labels, q, truth):
 def measure_operator(agent, obs, truth=None):
     """What one target does to the critics' errors. obs (B, O), truth (K, B) or None.
 
-    delta: mean over the states of rule(q_next) minus the mean over critics and actors
-    of q_next. It needs no truth. `y_min` is left out: it is no rule over q_next.
+    delta: mean over the states of `agent.next_value(q_next)`, the target's rule, minus
+    the mean over critics and actors of q_next. It needs no truth. `y_min` is left out:
+    it is no rule over q_next.
     sigma, kappa, rho: e[c, k] = q_next[c, k] - truth[k], less its mean over the states.
     sigma is their standard deviation; kappa the correlation of two critics at the same
     action (NaN with one critic); rho that of two actions within one critic (NaN with
@@ -439,15 +439,13 @@ def measure_operator(agent, obs, truth=None):
     actor_distance: mean distance of the first two actors' actions, which lie in
     [-1, 1] (NaN with one actor).
     """
-    n, config = len(obs), agent.config
+    n = len(obs)
     names = ("delta", "sigma", "kappa", "rho", "actor_distance")
     out = dict.fromkeys(names, np.nan) | {"n": n}
     if n < 2:
         return out
     q_next = np.asarray(agent.q_next(obs), np.float64)  # (C, K, B)
-    none = np.zeros(n)  # no reward, no end: y is rule(q_next) itself
-    y = td_target(none, none, q_next, 1.0, rule=config.target_rule, nu=config.nu)
-    out["delta"] = float(y.mean() - q_next.mean())
+    out["delta"] = float(agent.next_value(q_next).mean() - q_next.mean())
     actions = agent.actions(obs)  # (K, B, A)
     if len(actions) > 1:
         gap = np.linalg.norm(actions[0] - actions[1], axis=-1)  # (B,)
@@ -713,7 +711,7 @@ def take_apart(agent, world, states):
 
     From each of N states (N, S) the policy that acts is followed. With q_mean(t) the
     mean of the online critics at the action that it takes at step t, and delta(t) what
-    `target_rule` says there minus q_mean(t),
+    target's rule (`agent.next_value`) says there minus q_mean(t),
 
         q_mean(0) - truth = sum over t >= 0 of gamma^t [q_mean(t) - r - gamma v(t + 1)]
                           + sum over t >= 1 of gamma^t delta(t),   v = q_mean + delta.
@@ -724,8 +722,7 @@ def take_apart(agent, world, states):
     ValueError where some worlds end before others: the sums are of an endless path.
     """
     config, n = agent.config, len(states)
-    rows, nothing = np.arange(n), np.zeros(n)  # no reward, no end: y is the rule itself
-    q_mean, delta = [], []
+    rows, q_mean, delta = np.arange(n), [], []
 
     def watched(obs):
         if len(obs) < n:
@@ -736,8 +733,7 @@ def take_apart(agent, world, states):
         q = np.asarray(q, np.float64)
         chosen = choose_actor(q, config.act_rule)  # (N,)
         q_mean.append(q.mean(axis=0)[chosen, rows])  # over C
-        said = td_target(nothing, nothing, q, 1.0, config.target_rule, config.nu)
-        delta.append(said - q_mean[-1])
+        delta.append(agent.next_value(q) - q_mean[-1])
         return actions[chosen, rows]
 
     truth = rollout(world, states, watched, config.gamma)["truth"]
@@ -825,14 +821,17 @@ def selected(kappa, rho):
     return (1 - rho) * (1 + kappa) / (2 * spread) + min_of_two_critics(kappa)
 
 
-def predict(sigma, kappa, rho, rule, nu=0.1):
+def predict(sigma, kappa, rho, rule, nu=0.1, critics=2, actors=2):
     """The bias delta that `target_rule` makes in each new target, in closed form.
 
     sigma, kappa, rho as measured (`Measurement.operator`); NaN for kappa means one
-    critic, for rho one actor. At most two critics and two actors. nu is the weight ν
-    of `soft`. The operator alone: errors of mean 0. Units of sigma. ValueError for an
-    unknown rule.
+    critic, for rho one actor. nu is the weight ν of `soft`. The operator alone: errors
+    of mean 0. Units of sigma. ValueError for an unknown rule, and for more than two
+    critics or actors: there is no closed form here.
     """
+    if critics > 2 or actors > 2:
+        raise ValueError(f"critics={critics}, actors={actors}: the closed forms know "
+                         "two of each at most.")
     kappa, rho = (1.0 if np.isnan(c) else c for c in (kappa, rho))
     forms = {
         "single": lambda: min_of_two_critics(kappa),
@@ -850,7 +849,10 @@ def accumulated(delta, gamma, ends=0.0):
     """A bias delta made anew in each target grows to gamma delta / (1 - gamma).
 
     `ends` is the share of transitions that end the world; gamma (1 - ends) stands for
-    gamma then.
+    gamma then. ValueError if that is 1: such a bias has no limit.
     """
     gamma = gamma * (1 - ends)
+    if np.any(gamma >= 1):
+        raise ValueError("gamma=1 and no ends: a bias made anew in each target has no "
+                         "limit; expected gamma below 1.")
     return gamma * delta / (1 - gamma)

@@ -60,20 +60,16 @@ class EnvUnits(Training):
 
 
 class _OtherAgent(Training):
-    """A Training with another class of agent, `agent_class`: DDPG in NumPy only.
+    """A Training with another agent, which knows DDPG in NumPy only.
 
     Another config is refused with a ValueError.
     """
-
-    agent_class = NumpyAgent
 
     def __init__(self, config):
         if config.backend != "numpy" or (config.critics, config.actors) != (1, 1):
             raise ValueError(f"This faulty agent is written for DDPG in NumPy; got "
                              f"{config.algorithm!r}, backend={config.backend!r}.")
         super().__init__(config)
-        right = self.agent
-        self.agent = self.agent_class(config, right.obs_dim, right.action_dim)
 
 
 class LostAxisAgent(NumpyAgent):
@@ -116,10 +112,10 @@ class ThroughYAgent(NumpyAgent):
         q_next = self._q(batch.next_obs, self._act(batch.next_obs))  # (1, 1, B)
         return td_target(batch.reward, batch.terminated, q_next, self.config.gamma)
 
-    def _adam(self, part, lr):
+    def _adam(self, part, t, lr):
         if part.start == 0:  # the critic's step, not the actor's
             self.dtheta += self.gradient_through_y()
-        super()._adam(part, lr)
+        super()._adam(part, t, lr)
 
     def gradient_through_y(self):
         """The part that should not be there: a flat vector (weights,), like theta."""

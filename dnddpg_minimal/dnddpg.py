@@ -12,12 +12,12 @@ Networks of one kind stand side by side: every array of weights has a leading ax
 (C critics or K actors), and all of them are views into one flat vector.
 
     equation of the paper                        here
-    (1)  slow copies follow                      Agent.update
+    (1)  slow copies ("target networks") follow  Agent.update
     (2)  J = E[r1 + gamma r2 + ...]              what Training tries to make large
     (3)  mean squared TD error                   Agent.update, NumpyAgent.fit_critics
     (4)  policy gradient                         Agent.update, NumpyAgent.climb_critics
     (5)-(10) overestimation                      measured, in bias.py
-    (11) y = r + gamma min of two critics        td_target
+    (11) y = r + gamma min of two critics        next_value, td_target
     (12) the better of two actions               choose_actor, Agent.act
 
 Where the paper is silent or contradicts itself, the choice is a field of `Config`,
@@ -481,11 +481,11 @@ def adam(theta, dtheta, m, v, t, lr, beta1=0.9, beta2=0.999, eps=1e-8):
 # --- 5. Targets and choices -----------------------------------------------------------
 
 
-def td_target(reward, terminated, q_next, gamma, rule="max_min", nu=0.1, y_min=None):
-    """The value that every critic is drawn to: y = r + γ (1 - terminated) · Q of s'.
+def next_value(q_next, rule="max_min", nu=0.1):
+    """The value of the next states, (B,), that the target takes from q_next (C, K, B).
 
-    Eq. (11) and Eq. (12): `q_next` (C, K, B) holds the slow critics at the slow
-    actors' actions. The rules, all minima over the C critics:
+    Eq. (11) and Eq. (12): `q_next` holds the slow critics at the slow actors' actions.
+    The rules, all minima over the C critics:
 
         max_min     max over actors of the min                 section 3.2 in words
         single      the min at the first actor's action        Eq. (11) as printed
@@ -493,37 +493,46 @@ def td_target(reward, terminated, q_next, gamma, rule="max_min", nu=0.1, y_min=N
         selected    the min at the action that Eq. (12) picks
         soft        (1 - ν) · max + ν · min, over actors, of the min
 
-    With C = K = 1 all of them are DDPG's target. `reward` and `terminated` are (B,);
-    `terminated` is 1 or True where the world ended. `gamma` is the discount of one
-    step, `y_min` a lower limit of y. Returns y (B,), in units of return. Raises
-    ValueError for an unknown rule, shapes that do not match, a `terminated` that is
-    neither 0 nor 1, and a y that is not finite.
+    With C = K = 1 all of them are DDPG's value. Raises ValueError for an unknown rule,
+    and for shapes that do not match.
+    """
+    q_next = np.asarray(q_next)
+    if q_next.ndim != 3 or q_next.size == 0:
+        raise ValueError(f"q_next has shape {q_next.shape}: expected (C, K, B).")
+    critics, actors, size = q_next.shape
+    lowest = q_next.min(axis=0)  # (K, B), over critics
+    if rule == "max_min":
+        return lowest.max(axis=0)  # over actors; (B,)
+    if rule == "single":
+        return lowest[0]
+    if rule == "paired_min":
+        if critics != actors:
+            raise ValueError("rule='paired_min' needs as many actors as critics; got "
+                             f"q_next {q_next.shape}, axes (C, K, B).")
+        return q_next[range(actors), range(actors)].min(axis=0)
+    if rule == "selected":
+        return lowest[choose_actor(q_next, "paired"), np.arange(size)]
+    if rule == "soft":
+        return (1 - nu) * lowest.max(axis=0) + nu * lowest.min(axis=0)
+    raise ValueError(_not_allowed("rule", rule, CHOICES["target_rule"]))
+
+
+def td_target(reward, terminated, q_next, gamma, rule="max_min", nu=0.1, y_min=None):
+    """Eq. (11), what critics are drawn to: y = r + γ (1 - terminated) · value of s'.
+
+    The value is `next_value(q_next, rule, nu)`, q_next (C, K, B). `reward` and
+    `terminated` are (B,); `terminated` is 1 or True where the world ended. `gamma` is
+    the discount of one step, `y_min` a lower limit of y. Returns y (B,), in units of
+    return. Raises ValueError for an unknown rule, shapes that do not match, a
+    `terminated` that is neither 0 nor 1, and a y that is not finite.
     """
     reward, ends, q_next = map(np.asarray, (reward, terminated, q_next))
-    if not (q_next.ndim == 3 and reward.shape == ends.shape == q_next.shape[2:]
-            and q_next.size > 0):
+    if not (q_next.ndim == 3 and reward.shape == ends.shape == q_next.shape[2:]):
         raise ValueError("td_target expects shapes (B,), (B,) and (C, K, B); got "
                          f"{reward.shape}, {ends.shape} and {q_next.shape}.")
     if not ((ends == 0) | (ends == 1)).all():
         raise ValueError(f"terminated={ends!r}: expected 0 or 1 for each transition.")
-    actors = q_next.shape[1]
-    lowest = q_next.min(axis=0)  # (K, B), over critics
-    if rule == "max_min":
-        value = lowest.max(axis=0)  # over actors; (B,)
-    elif rule == "single":
-        value = lowest[0]
-    elif rule == "paired_min":
-        if len(q_next) != actors:
-            raise ValueError("rule='paired_min' needs as many actors as critics; got "
-                             f"q_next {q_next.shape}, axes (C, K, B).")
-        value = q_next[range(actors), range(actors)].min(axis=0)
-    elif rule == "selected":
-        value = lowest[choose_actor(q_next, "paired"), np.arange(len(reward))]
-    elif rule == "soft":
-        value = (1 - nu) * lowest.max(axis=0) + nu * lowest.min(axis=0)
-    else:
-        raise ValueError(_not_allowed("rule", rule, CHOICES["target_rule"]))
-    y = reward + gamma * np.where(ends, 0, value)
+    y = reward + gamma * np.where(ends, 0, next_value(q_next, rule, nu))
     if y_min is not None:
         y = np.maximum(y, y_min)
     if not np.isfinite(y).all():
@@ -592,7 +601,7 @@ class Agent:
             first_weights(layers, [stream(config.seed, role, 0 if tied else n)
                                    for n in range(len(layers[0]))])
         self.set_arrays(dict(theta=theta, theta_target=theta, adam_m=zeros,
-                             adam_v=zeros, updates=0))
+                             adam_v=zeros, updates=0, climbs=0))
 
     def cut(self, theta):
         """Views into a flat vector theta (size,): (critics' layers, actors' layers)."""
@@ -602,7 +611,7 @@ class Agent:
     def arrays(self):
         """All that learning changes, as copies: STATE, each (size,), and `updates`."""
         state = {name: self._numpy(getattr(self, name)) for name in self.STATE}
-        return state | dict(updates=self.updates)
+        return state | dict(updates=self.updates, climbs=self.climbs)
 
     def set_arrays(self, arrays):
         """Go on from the `arrays` of either agent. ValueError if shapes differ."""
@@ -612,6 +621,7 @@ class Agent:
                                  f"({self.size},)")
             setattr(self, name, self._array(arrays[name]))
         self.updates = int(arrays["updates"])
+        self.climbs = int(arrays.get("climbs", self.updates))  # an old file has none
         self.critic, self.actor = self.cut(self.theta)
         self.critic_target, self.actor_target = self.cut(self.theta_target)
         self._prepare()
@@ -660,11 +670,15 @@ class Agent:
         pairs = [layer[:, None] for layer in layers]  # (C, 1, in + 1, out)
         return self._out(pairs, join(obs, action))[..., 0]
 
+    def next_value(self, q_next):
+        """The value of next states by the config's rule: (C, K, B) → (B,)."""
+        return next_value(q_next, self.config.target_rule, self.config.nu)
+
     def td_target(self, batch):
-        """y (B,) of a batch, by the config's rule. No gradient flows through it."""
-        config = self.config
-        return td_target(batch.reward, batch.terminated, self.q_next(batch.next_obs),
-                         config.gamma, config.target_rule, config.nu, config.y_min)
+        """y (B,) of a batch. No gradient flows through it."""
+        value = self.next_value(self.q_next(batch.next_obs))
+        return td_target(batch.reward, batch.terminated, value[None, None],
+                         self.config.gamma, y_min=self.config.y_min)
 
     def update(self, batch, climb=True):
         """One update: critics, then actors (if `climb`), then slow copies.
@@ -681,6 +695,7 @@ class Agent:
         losses = {"critic": self.fit_critics(batch, y),  # Eq. (3)
                   "actor": np.full(config.actors, np.nan)}
         if climb:
+            self.climbs += 1
             losses["actor"] = self.climb_critics(batch)  # Eq. (4)
         if self.updates % config.target_every == 0:  # Eq. (1)
             self.theta_target += config.tau * (self.theta - self.theta_target)
@@ -734,7 +749,7 @@ class NumpyAgent(Agent):
         layers = forward(self.critic, join(batch.obs, batch.action))
         error = layers[-1][..., 0] - y  # (C, B)
         backward(self.critic, layers, (2 / size) * error[..., None], self.dcritic)
-        self._adam(slice(0, self.split), self.config.critic_lr)
+        self._adam(slice(0, self.split), self.updates, self.config.critic_lr)
         return (error * error).sum(axis=1) / size
 
     def climb_critics(self, batch):
@@ -751,12 +766,12 @@ class NumpyAgent(Agent):
         daction = backward(critic, layers, dq, inputs=slice(self.obs_dim, -1))
         daction *= 1 - action * action  # through tanh
         backward(self.actor, hidden, daction, self.dactor)
-        self._adam(slice(self.split, None), self.config.actor_lr)
+        self._adam(slice(self.split, None), self.climbs, self.config.actor_lr)
         return layers[-1][..., 0].sum(axis=1) / -size
 
-    def _adam(self, part, lr):
+    def _adam(self, part, t, lr):
         adam(self.theta[part], self.dtheta[part], self.adam_m[part], self.adam_v[part],
-             self.updates, lr)
+             t, lr)
 
 
 class TorchAgent(Agent):
@@ -781,16 +796,17 @@ class TorchAgent(Agent):
         return tensor.detach().cpu().numpy().copy()
 
     def _prepare(self):
-        rates = self.config.critic_lr, self.config.actor_lr
+        config = self.config
         parts = zip((self.critic, self.actor), self.cut(self.adam_m),
-                    self.cut(self.adam_v), rates, strict=True)
+                    self.cut(self.adam_v), (self.updates, self.climbs),
+                    (config.critic_lr, config.actor_lr), strict=True)
         self.critic_adam, self.actor_adam = (self._adam(*part) for part in parts)
 
-    def _adam(self, layers, m, v, lr):
+    def _adam(self, layers, m, v, steps, lr):
         """PyTorch's Adam on these layers, with our vectors as its moments."""
         optimizer = self.torch.optim.Adam([x.requires_grad_() for x in layers], lr=lr)
         for i, layer in enumerate(layers):
-            step = self.torch.tensor(float(self.updates))
+            step = self.torch.tensor(float(steps))
             optimizer.state[layer] = dict(step=step, exp_avg=m[i], exp_avg_sq=v[i])
         return optimizer
 
@@ -867,12 +883,12 @@ def make_env(config, render_mode=None):
     `render_mode`: None, "human" (a window) or "rgb_array" (pictures), as in Gymnasium.
     """
     named = f"task={config.task!r}"
+    shown = {"render_mode": render_mode} if render_mode else {}
     try:
         if "mujoco" in str(gym.spec(config.task).entry_point):
             _quiet_mujoco()
         env = gym.make(config.task, max_episode_steps=config.max_episode_steps,
-                       disable_env_checker=True, render_mode=render_mode,
-                       **config.task_options)
+                       disable_env_checker=True, **shown, **config.task_options)
     except (gym.error.Error, ImportError, TypeError) as error:
         why = f"can't be made with task_options={config.task_options}: {error}"
         if config.task.split(":")[-1] not in gym.registry:
@@ -951,13 +967,16 @@ class Training:
 
     `save(path)` writes the state at the last episode's end, and `Training.load(path)`
     goes on from there with the same numbers, bit for bit, as if never stopped.
+    A subclass may name an agent of its own as its `agent_class`.
     """
+
+    agent_class = staticmethod(make_agent)
 
     def __init__(self, config):
         self.config, self.env = config, make_env(config)
         (obs_dim,), (action_dim,) = (self.env.observation_space.shape,
                                      self.env.action_space.shape)
-        self.agent = make_agent(config, obs_dim, action_dim)
+        self.agent = self.agent_class(config, obs_dim, action_dim)
         self.streams = {role: stream(config.seed, role) for role in
                         ("replay", "noise", "warmup", "environment", "keep")}
         self.replay = ReplayBuffer(config.buffer_size, obs_dim, action_dim,
@@ -1091,6 +1110,7 @@ class Training:
             step=self.step, episode=self.episode, keep_at=self.keep_at,
             noise_scale=self.noise.scale, records=self.records.copy(),
             kept=self.kept.copy(), first_losses=self.first_losses.copy(),
+            agent=type(self.agent).__name__,
             streams={role: rng.bit_generator.state
                      for role, rng in self.streams.items()})
 
@@ -1130,6 +1150,10 @@ class Training:
 
     def _restore(self, content):
         small = json.loads(str(content["small"]), object_hook=_array_from_json)
+        mine = type(self.agent).__name__
+        if small.get("agent", mine) != mine:
+            raise ValueError(f"its agent is a {small['agent']}, and this Training's a "
+                             f"{mine}")
         for name in ("step", "episode", "keep_at", "kept", "first_losses"):
             setattr(self, name, small[name])
         self.records = [Record(*record) for record in small["records"]]

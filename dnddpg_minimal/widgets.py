@@ -30,8 +30,8 @@ from dnddpg_minimal.dnddpg import (
     Config,
     Training,
     choose_actor,
+    next_value,
     stream,
-    td_target,
 )
 
 
@@ -147,7 +147,7 @@ def expected_max(n):
 
 def simulated_y(critics=1, actors=2, sigma=1.0, rho=0.0, kappa=1.0, gap=0.0,
                 rule="max_min", draws=DRAWS):
-    """y of a next state whose best action is truly worth 0, by `rule`: (draws,).
+    """Value of a next state whose best action is truly worth 0, by `rule`: (draws,).
 
     The errors e[c, k] of the critics at the actors' actions are normal, mean 0,
     standard deviation σ. Two actions within one critic correlate by ρ, two critics at
@@ -165,8 +165,7 @@ def simulated_y(critics=1, actors=2, sigma=1.0, rho=0.0, kappa=1.0, gap=0.0,
              + math.sqrt((1 - kappa) * (1 - rho)) * z(critics, actors))  # by none
     q_next = sigma * error  # (C, K, draws)
     q_next[:, 1:] -= gap
-    nothing = np.zeros(draws)
-    return td_target(nothing, nothing, q_next, gamma=1.0, rule=rule)
+    return next_value(q_next, rule)
 
 
 def closed_form(critics=1, actors=2, sigma=1.0, rho=0.0, kappa=1.0, gap=0.0,

@@ -1,0 +1,164 @@
+"""A rule, an agent, a task of one's own: what a reader adds, the file unchanged."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from dnddpg_minimal import (
+    Batch,
+    Config,
+    NumpyAgent,
+    TorchAgent,
+    Training,
+    bias,
+    choose_actor,
+    make_env,
+    next_value,
+)
+
+PENDULUM = dict(task="Pendulum-v1", hidden=(8, 8), batch_size=8, warmup=20, steps=300)
+
+
+class Largest(NumpyAgent):
+    """The largest of all numbers: as far as one can be from the config's rule."""
+
+    def next_value(self, q_next):
+        return q_next.max(axis=(0, 1))
+
+
+class Delayed(NumpyAgent):
+    """The actors climb at every second update."""
+
+    def update(self, batch, climb=True):
+        return super().update(batch, climb and self.updates % 2 == 1)
+
+
+class DelayedTorch(TorchAgent):
+    """The same for PyTorch."""
+
+    def update(self, batch, climb=True):
+        return super().update(batch, climb and self.updates % 2 == 1)
+
+
+class LargestTraining(Training):
+    agent_class = Largest
+
+
+def batches(n=40, size=16):
+    rng = np.random.default_rng(0)
+    for _ in range(n):
+        yield Batch(rng.normal(size=(size, 3)), rng.uniform(-1, 1, (size, 1)),
+                    rng.normal(size=size), rng.normal(size=(size, 3)), np.zeros(size))
+
+
+def test_a_rule_of_ones_own_reaches_the_target_and_both_instruments():
+    config = Config(**PENDULUM, gamma=0.9)
+    own, plain = Largest(config, 3, 1), NumpyAgent(config, 3, 1)
+    (batch,) = batches(1)
+    q_next = plain.q_next(batch.next_obs)
+    expected = batch.reward + 0.9 * q_next.max(axis=(0, 1))
+    assert np.allclose(own.td_target(batch), expected)
+    assert not np.allclose(plain.td_target(batch), expected)
+
+    delta = bias.measure_operator(own, batch.obs)["delta"]
+    q = own.q_next(batch.obs).astype(float)
+    assert np.isclose(delta, q.max(axis=(0, 1)).mean() - q.mean())
+
+    world = bias.dynamics(config)
+    states = world.reset(np.random.default_rng(0), 5)
+    found = bias.take_apart(own, world, states)["delta"][0]  # at the first states
+    obs = world.observe(states)
+    q = np.stack([own.q_values(obs, a) for a in own.actions(obs)], axis=1)  # (C, K, N)
+    mean = q.mean(axis=0)[choose_actor(q, "paired"), np.arange(5)]
+    assert np.allclose(found, q.max(axis=(0, 1)) - mean, atol=1e-5)
+
+
+def test_td_target_of_one_value_is_that_value_under_every_rule():
+    """The agent hands its value on as (1, 1, B): no rule may change it."""
+    q_next = np.random.default_rng(0).normal(size=(1, 1, 7))
+    for rule in ("max_min", "single", "paired_min", "selected", "soft"):
+        assert np.allclose(next_value(q_next, rule), q_next[0, 0])
+
+
+def test_a_training_with_an_agent_of_its_own_resumes_bit_for_bit(tmp_path):
+    config = Config(**PENDULUM)
+    whole = LargestTraining(config)
+    assert type(whole.agent) is Largest
+    for record in whole:
+        if record.kind == "episode" and record.step == 200:
+            whole.save(tmp_path / "run.npz")
+    again = LargestTraining.load(tmp_path / "run.npz")
+    assert type(again.agent) is Largest and again.step == 200
+    for _ in again:
+        pass
+    assert np.array_equal(again.agent.theta, whole.agent.theta)
+
+
+def test_a_plain_training_does_not_go_on_with_another_agents_run(tmp_path):
+    LargestTraining(Config(**PENDULUM)).save(tmp_path / "run.npz")
+    with pytest.raises(ValueError, match="its agent is a Largest.*NumpyAgent"):
+        Training.load(tmp_path / "run.npz")
+
+
+def test_actors_that_climb_more_rarely_have_a_step_count_of_their_own(tmp_path):
+    """Adam corrects its moments by its own number of steps, not by the critics'."""
+    pytest.importorskip("torch")
+    config = Config(**PENDULUM, dtype="float64")
+    mine, torchs = Delayed(config, 3, 1), DelayedTorch(config, 3, 1)
+    for i, batch in enumerate(batches()):
+        mine.update(batch)
+        torchs.update(batch)
+        if i == 20:  # and a file keeps it
+            torchs.save(tmp_path / "agent.npz")
+            torchs = DelayedTorch.load(tmp_path / "agent.npz")
+    assert (mine.updates, mine.climbs) == (torchs.updates, torchs.climbs) == (40, 20)
+    assert np.abs(mine.theta - torchs.arrays()["theta"]).max() < 1e-9
+
+
+def test_the_first_step_of_a_late_climb_is_as_long_as_adams_first_step():
+    agent = Delayed(Config(**PENDULUM, dtype="float64"), 3, 1)
+    (first, second) = batches(2)
+    agent.update(first)
+    before = agent.theta[agent.split:].copy()
+    agent.update(second)
+    moved = np.abs(agent.theta[agent.split:] - before)
+    assert np.isclose(moved.max(), agent.config.actor_lr, rtol=1e-3)
+
+
+class NoPictures(gym.Env):
+    """A task whose maker never thought of pictures: no `render_mode`."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def __init__(self):
+        pass
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+
+def test_a_task_without_render_mode_can_be_made():
+    gym.register("NoPictures-v0", entry_point=NoPictures, max_episode_steps=10)
+    try:
+        env = make_env(Config("NoPictures-v0"))
+        env.reset(seed=0)
+        with pytest.raises(ValueError, match="NoPictures"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Gymnasium's, before the refusal
+            make_env(Config("NoPictures-v0"), render_mode="rgb_array")
+    finally:
+        del gym.registry["NoPictures-v0"]
+
+
+def test_the_closed_forms_refuse_what_they_do_not_know():
+    for numbers in (dict(critics=5), dict(actors=3)):
+        with pytest.raises(ValueError, match="two of each"):
+            bias.predict(1.0, 0.5, 0.5, "max_min", **numbers)
+    with pytest.raises(ValueError, match="no limit"):
+        bias.accumulated(0.1, 1.0)
+    assert np.isclose(bias.accumulated(0.1, 1.0, ends=0.5), 0.1)
