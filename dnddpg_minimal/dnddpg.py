@@ -426,7 +426,8 @@ def forward(layers, x):
     ReLU after every layer but the last; h (N, B, H + 1), z (N, B, out).
     """
     activations = [x]
-    lead = np.broadcast(x[..., :1, 0], layers[0][..., :1, 0]).shape[:-1]  # (N,)
+    # x may lack the axes in front (N,), or have others than the layers: broadcast
+    lead = np.broadcast_shapes(x.shape[:-2], layers[0].shape[:-2])
     for layer in layers[:-1]:
         h = np.empty((*lead, x.shape[-2], layer.shape[-1] + 1), x.dtype)
         h[..., -1] = 1
@@ -469,6 +470,7 @@ def adam(theta, dtheta, m, v, t, lr, beta1=0.9, beta2=0.999, eps=1e-8):
     m += (1 - beta1) * dtheta
     v *= beta2
     v += (1 - beta2) * dtheta**2
+    # m^ = m / (1 - beta1^t) and v^ = v / (1 - beta2^t); below: lr m^ / (sqrt(v^) + eps)
     step = np.sqrt(v, out=dtheta)
     step += eps * correction
     np.divide(m, step, out=step)
@@ -746,9 +748,10 @@ class NumpyAgent(Agent):
         What falls is the sum over critics, so that each learns as if it were alone.
         """
         size = len(y)
-        layers = forward(self.critic, join(batch.obs, batch.action))
-        error = layers[-1][..., 0] - y  # (C, B)
-        backward(self.critic, layers, (2 / size) * error[..., None], self.dcritic)
+        activations = forward(self.critic, join(batch.obs, batch.action))
+        error = activations[-1][..., 0] - y  # (C, B)
+        dq = (2 / size) * error[..., None]  # (C, B, 1)
+        backward(self.critic, activations, dq, self.dcritic)
         self._adam(slice(0, self.split), self.updates, self.config.critic_lr)
         return (error * error).sum(axis=1) / size
 
@@ -761,13 +764,13 @@ class NumpyAgent(Agent):
         hidden = forward(self.actor, join(batch.obs))
         action = np.tanh(hidden[-1])  # (K, B, A)
         critic = [layer[self.climbed] for layer in self.critic]
-        layers = forward(critic, join(batch.obs, action))
-        dq = np.full(layers[-1].shape, -1 / size, self.dtype)  # up is minus down
-        daction = backward(critic, layers, dq, inputs=slice(self.obs_dim, -1))
+        activations = forward(critic, join(batch.obs, action))
+        dq = np.full(activations[-1].shape, -1 / size, self.dtype)  # up is minus down
+        daction = backward(critic, activations, dq, inputs=slice(self.obs_dim, -1))
         daction *= 1 - action * action  # through tanh
         backward(self.actor, hidden, daction, self.dactor)
         self._adam(slice(self.split, None), self.climbs, self.config.actor_lr)
-        return layers[-1][..., 0].sum(axis=1) / -size
+        return activations[-1][..., 0].sum(axis=1) / -size
 
     def _adam(self, part, t, lr):
         adam(self.theta[part], self.dtheta[part], self.adam_m[part], self.adam_v[part],

@@ -15,6 +15,7 @@ A record is one small file: recordings/<task>/<variant>/<algorithm>-<seed>.npz.
 
 import json
 import warnings
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,7 +23,13 @@ import gymnasium
 import numpy as np
 
 from dnddpg_minimal import bias
-from dnddpg_minimal.dnddpg import ALGORITHMS, MUJOCO_TASKS, Config, make_agent
+from dnddpg_minimal.dnddpg import (
+    ALGORITHMS,
+    MUJOCO_TASKS,
+    Config,
+    _nearest,
+    make_agent,
+)
 
 FORMAT = 1  # of a record
 RECORDINGS = Path(__file__).parent / "recordings"
@@ -65,7 +72,9 @@ def load_study(task=None, algorithm=None, variant="class", what="evaluations",
         meta      config, versions, processor, seconds, ..., first_losses (20, C)
 
     T times of the run, N points of an axis; pictures have the axes [y, x]. A damaged
-    or foreign file is named in a warning and skipped. ValueError for an unknown `what`.
+    or foreign file is named in a warning and skipped. What is planned and not recorded
+    yet is an empty table or list. ValueError for an unknown `what`, and for a task, an
+    algorithm or a variant that is neither planned nor recorded.
     """
     if what not in WHAT:
         raise ValueError(f"what={what!r}: expected one of {', '.join(WHAT)}.")
@@ -77,11 +86,27 @@ def load_study(task=None, algorithm=None, variant="class", what="evaluations",
         except Exception as error:  # zipfile and NumPy raise a dozen kinds
             warnings.warn(f"{path} is skipped: it is damaged, or no record of this "
                           f"study ({type(error).__name__}: {error})", stacklevel=2)
+    if not found:
+        _refuse_unknown(folder, task=task, variant=variant, algorithm=algorithm)
     found.sort(key=lambda one: _order(*(one[name] for name in RUN)))
     return _frame(found) if what in TABLES else found
 
 
 RUN = ("task", "algorithm", "variant", "seed")
+
+
+def _refuse_unknown(folder, **asked):
+    """ValueError if a name that was asked for is neither planned nor recorded."""
+    from dnddpg_minimal.study import list_of
+
+    names = [run.name for budget in ("class", "paper") for run in list_of(budget)]
+    names += [path.relative_to(folder or RECORDINGS).as_posix()
+              for path in Path(folder or RECORDINGS).glob("*/*/*-*.npz")]
+    parts = zip(*(name.rpartition("-")[0].split("/") for name in names), strict=True)
+    for (field, value), known in zip(asked.items(), parts, strict=True):
+        if value is not None and value not in known:
+            raise ValueError(f"Nothing is planned or recorded with {field}={value!r}."
+                             f"{_nearest(value, sorted(set(known)))}")
 
 
 def _order(task, algorithm, variant, seed):
@@ -254,10 +279,11 @@ def claims(runs):
     """What the paper says, against the runs of `results`: one row per task and claim.
 
     Differences are paired by seed; a verdict needs three of them, and a 95 % t interval
-    on one side of 0. `owed` is the part of a bias that a critic's lag alone explains;
+    on one side of 0. `corrected` is the verdict after Holm's correction over all of
+    these claims. `owed` is the part of a bias that a critic's lag alone explains;
     `beyond` is the verdict on the bias minus what its own run owes.
     """
-    from dnddpg_minimal.statistics import verdict
+    from dnddpg_minimal.statistics import OPEN, holm, p_value, verdict
 
     def of(name, algorithm):
         chosen = runs.index.get_level_values("algorithm") == algorithm  # may be none
@@ -280,7 +306,10 @@ def claims(runs):
                 lag = owed.reindex(group.index).mean()
                 beyond = verdict((group - owed.reindex(group.index)).dropna())
             found.append(dict(task=task, claim=claim, mean=mean, error=error, n=n,
-                              owed=lag, verdict=verdict(group), beyond=beyond))
+                              owed=lag, verdict=verdict(group), beyond=beyond,
+                              p=p_value(group)))
+    for one, p in zip(found, holm([one["p"] for one in found]), strict=True):
+        one["corrected"] = OPEN if p >= 0.05 else one["verdict"]
     return found
 
 
@@ -334,6 +363,9 @@ def write_readme(folder=None):
 
     ValueError if the folder has no record, or its README.md not both marks in order.
     """
+    from dnddpg_minimal.statistics import OPEN
+    from dnddpg_minimal.study import list_of
+
     path = Path(folder or RECORDINGS) / "README.md"
     begin, end = "<!-- measured -->\n", "<!-- end -->"
     before, begun, rest = path.read_text(encoding="utf-8").partition(begin)
@@ -345,11 +377,14 @@ def write_readme(folder=None):
         raise ValueError(f"{path.parent} holds no record yet: there is nothing to put "
                          "into the tables.")
     runs, table = results(None, folder)
-    text = [f"{len(runs)} runs. Each number: mean ± standard error (number of runs). A "
-            "run counts by the mean of its last ten evaluations, on MuJoCo five. What "
-            "has fewer steps than `class` stands beside `class` cut at these steps.\n"]
+    plan = Counter(run.name.rpartition("-")[0] for run in list_of("class"))
+    text = [f"{len(runs)} of {plan.total()} runs. Each number: mean ± standard error "
+            "over the runs. A run counts by the mean of its last ten evaluations, on "
+            "MuJoCo five. What has fewer steps than `class` stands beside `class` cut "
+            "at these steps. *runs*: how many there are, of how many the plan names; "
+            "where some are missing, the row is interim.\n"]
     row = "| {} |".format
-    heads = ["task", "variant", "steps", "algorithm", "return", "bias of Q",
+    heads = ["task", "variant", "steps", "algorithm", "runs", "return", "bias of Q",
              "owed to lag"]
     text += [row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
     lines = [(names, values) for names, values in table.iterrows()]
@@ -362,22 +397,26 @@ def write_readme(folder=None):
                   for name, values in early.iterrows()]
     lines.sort(key=lambda line: _order(line[0][0], line[0][2], line[0][1], 0)[:4])
     for (task, variant, algorithm), values in lines:
-        cells = ["{:.4g} ± {:.2g} ({})".format(*value) if value[2] > 1 else
-                 "{:.4g} (1)".format(*value) for value in values[:3]]
+        cells = ["{:.4g} ± {:.2g}".format(*value) if value[2] > 1 else
+                 "{:.4g}".format(*value) for value in values[:3]]
+        planned = plan[f"{task}/{variant.partition(', ')[0]}/{algorithm}"]
+        count = f"{values['return'][2]} of {planned}"
         text.append(row(" | ".join([task, variant, f"{values.steps:.0f}", algorithm,
-                                    *cells])))
+                                    count, *cells])))
     heads = ["claim", "task", "difference", "owed to lag", "verdict",
-             "verdict beyond lag"]
+             "after Holm's correction", "verdict beyond lag"]
     text += ["", row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
     of_class = runs.xs("class", level="variant", drop_level=False)
     found = claims(of_class)
     for one in found:
         owed = f"{one['owed']:.3g}" if np.isfinite(one["owed"]) else "–"
         text.append("| {claim} | {task} | {mean:.3g} ± {error:.2g} ({n}) | {} | "
-                    "{verdict} | {beyond} |".format(owed, **one))
-    many = sum(one["n"] > 2 for one in found)
-    text += ["", f"{many} verdicts at 95 %: by chance alone {many / 20:.1f} would "
-             "leave 0 out."]
+                    "{verdict} | {corrected} | {beyond} |".format(owed, **one))
+    many = [one for one in found if one["n"] > 2]
+    text += ["", f"{len(many)} verdicts at 95 %: by chance alone {len(many) / 20:.1f} "
+             f"would leave 0 out. {sum(one['p'] < 0.05 for one in many)} do, and "
+             f"{sum(one['corrected'] != OPEN for one in many)} still after Holm's "
+             "correction."]
     heads = ["difference in bias", "task", "grown from δ as measured",
              "grown from σ, κ, ρ", "measured, states from memory",
              "measured, start states"]

@@ -346,6 +346,38 @@ HOLDS, FAILS = "holds", "does not hold"
 OPEN, UNTESTED = "not distinguishable", "not tested at this budget"
 
 
+def p_value(differences):
+    """Chance of a mean so far from 0, were the true one 0: t test, two-sided.
+
+    differences (n,). Below 0.05 where the 95 % t interval leaves 0 out. NaN for fewer
+    than three.
+    """
+    from scipy.stats import ttest_1samp
+
+    differences = np.asarray(differences, np.float64)
+    if len(differences) < FEWEST:
+        return np.nan
+    if np.ptp(differences) == 0:  # all equal: sure, or nothing at all
+        return float(differences[0] == 0)
+    return float(ttest_1samp(differences, 0).pvalue)
+
+
+def holm(p_values):
+    """Holm's correction (1979) for many questions: adjusted p-values, (m,).
+
+    The smallest of m is multiplied by m, the next by m - 1, and so on; none may become
+    smaller than the one before it. Of those that stay below 0.05, the chance of even
+    one error is 5 % at the most, whatever the questions have in common. p_values (m,);
+    NaN counts as not asked, and stays NaN.
+    """
+    p = np.asarray(p_values, np.float64)
+    order = np.argsort(p)[:np.isfinite(p).sum()]  # NaN are sorted to the end
+    adjusted = np.full(p.shape, np.nan)
+    raised = np.arange(len(order), 0, -1) * p[order]
+    adjusted[order] = np.minimum(1, np.maximum.accumulate(raised))
+    return adjusted
+
+
 def verdict(differences, claim="greater", margin=0.0, tested=True,
             confidence=CONFIDENCE):
     """What paired differences say about a claim, by their t interval: a text.

@@ -309,3 +309,31 @@ def test_a_single_difference_is_drawn_without_a_mean_and_without_an_interval():
         for task, d in (("Pendulum-v1", one), ("Hopper-v5", none))}}
     (ax,) = np.ravel(plots.plot_paired_by_task(found))
     assert "|" not in [line.get_marker() for line in ax.get_lines()]
+
+
+# --- many questions -------------------------------------------------------------------
+
+
+def test_p_value_and_interval_agree():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        d = rng.normal(0.5, 1, rng.integers(3, 12))
+        low, high = st.t_interval(d)
+        assert (st.p_value(d) < 0.05) == (low > 0 or high < 0)
+    assert np.isnan(st.p_value([1.0, 2.0]))
+    assert (st.p_value([0.0] * 4), st.p_value([2.0] * 4)) == (1, 0)
+
+
+def test_holm_by_hand():
+    """0.01 · 4, 0.02 · 3, 0.03 · 2; 0.04 · 1 may not fall below the one before."""
+    found = st.holm([0.04, np.nan, 0.01, 0.03, 0.02])
+    assert np.allclose(found, [0.06, np.nan, 0.04, 0.06, 0.06], equal_nan=True)
+    assert st.holm([0.6, 0.9]).tolist() == [1, 1]
+    assert len(st.holm([])) == 0
+
+
+def test_holm_is_wrong_about_one_of_many_in_one_study_of_twenty_at_most():
+    rng = np.random.default_rng(0)
+    p = rng.uniform(size=(4_000, 10))  # no difference is real
+    wrong = np.mean([(st.holm(one) < 0.05).any() for one in p])
+    assert 0.035 < wrong < 0.065 < np.mean((p < 0.05).any(axis=1))

@@ -697,11 +697,23 @@ def test_the_readme_gets_its_tables_and_keeps_its_words(tmp_path, monkeypatch):
     assert study.main(["--readme", "--folder", str(tmp_path)]) == 0
     once = (tmp_path / "README.md").read_text(encoding="utf-8")
     assert once.startswith(before[:before.index("<!-- measured -->")])
-    assert re.search(r"\| Pendulum-v1 \| class \| \d+ \| DN-DDPG \| ", once)
+    assert re.search(r"\| Pendulum-v1 \| class \| \d+ \| DN-DDPG \| 2 of 10 \| ", once)
     assert "± " in once
     assert "| bias: DDPG > 0 | Pendulum-v1 | " in once
     records.write_readme(tmp_path)
     assert (tmp_path / "README.md").read_text(encoding="utf-8") == once
+
+
+def test_a_name_that_nobody_planned_is_refused_and_a_planned_one_is_empty(tmp_path):
+    for asked, words in ((dict(task="Pendulum"), "Did you mean 'Pendulum-v1'"),
+                         (dict(algorithm="TD3"), "algorithm='TD3'"),
+                         (dict(variant="target_rule=sinlge"), "target_rule=single")):
+        with pytest.raises(ValueError, match=words):
+            study.load_study(**asked)
+    assert study.load_study(variant="paper", folder=tmp_path).empty
+    study.record(study.Run(tiny(steps=300).config, "mine"), tmp_path, tmp_path / "s")
+    assert len(study.load_study(variant="mine", folder=tmp_path))
+    assert study.load_study("Hopper-v5", variant="mine", folder=tmp_path).empty
 
 
 def test_a_claim_needs_an_interval_on_one_side_of_zero():
@@ -758,10 +770,10 @@ def critic_gradient(monkeypatch):
     """The gradients that updates hand to Adam for the critics, one after the other."""
     seen, adam = [], NumpyAgent._adam
 
-    def spy(self, part, lr):
+    def spy(self, part, t, lr):
         if part.start == 0:
             seen.append(self.dtheta[part].copy())
-        adam(self, part, lr)
+        adam(self, part, t, lr)
 
     monkeypatch.setattr(NumpyAgent, "_adam", spy)
     return seen
