@@ -1,6 +1,7 @@
 """`python -m dnddpg_minimal check exercises/NN_name.ipynb`: points, and what is wrong.
 
-The notebook runs from top to bottom in a fresh kernel. Whoever changed a check does
+Several notebooks may be named, and `--csv FILE` collects their points in a table. Each
+notebook runs from top to bottom in a fresh kernel. Whoever changed a check does
 not fool it: checks and given code are taken from `solutions/` where that folder is,
 hidden tests included. Without it the notebook's own are taken, and a check that was
 changed earns nothing. (It is no fortress: who rewrites the package itself can pass.)
@@ -28,19 +29,51 @@ def main(argv=None) -> int:
     return tyro.cli(command, args=argv, prog="python -m dnddpg_minimal check")
 
 
-def command(notebook: Annotated[Path, tyro.conf.Positional], seconds: int = 60,
-            total: int = 300) -> int:
-    """Run an exercise notebook afresh; print its points, and what is wrong.
+def command(notebooks: Annotated[tuple[Path, ...], tyro.conf.Positional],
+            seconds: int = 60, total: int = 300, csv: Path | None = None) -> int:
+    """Run exercise notebooks afresh; print their points, and what is wrong.
 
-    A time limit below 1 is refused, and a file that is no exercise.
+    A time limit below 1 is refused, and a file that is no exercise. Of several files
+    such a one is named and left out.
 
     Args:
-        notebook: the notebook to check; it is not changed.
+        notebooks: what to check, one or more files; they are not changed.
         seconds: time limit of one cell. A cell that takes longer is left out.
-        total: time limit of the whole notebook.
+        total: time limit of a whole notebook.
+        csv: also write a table to this file: a row per notebook and exercise.
     """
+    import pandas as pd
+
     if min(seconds, total) < 1:
         raise ValueError(f"--seconds {seconds} --total {total}: expected 1 or more")
+    if not notebooks:
+        raise ValueError("no notebook named: expected one file or more")
+    if csv is not None and not csv.parent.is_dir():
+        raise ValueError(f"--csv {csv}: there is no folder {csv.parent}")
+    rows, code = [], 0
+    for notebook in notebooks:
+        try:
+            found = check(notebook, seconds, total)
+        except (OSError, ValueError) as error:
+            if len(notebooks) == 1:
+                raise
+            print(f"{notebook}: left out. {error}\n")
+            code = 2
+            continue
+        code = max(code, int(any(one["points"] < one["possible"] for one in found)))
+        rows += [{"notebook": str(notebook)} | one for one in found]
+        if csv is not None:  # after each: nothing is lost if a later one goes wrong
+            pd.DataFrame(rows).to_csv(csv, index=False)
+        if len(notebooks) > 1:
+            print()
+    return code
+
+
+def check(notebook, seconds, total):
+    """Run one notebook, print what was found; a dict for each exercise.
+
+    The time limits are `command`'s. OSError or ValueError if it is no exercise.
+    """
     nb = read(notebook)
     source, where = source_of(nb, notebook)
     cells, changed = with_checks_of(source, nb)
@@ -54,7 +87,9 @@ def command(notebook: Annotated[Path, tyro.conf.Positional], seconds: int = 60,
     points = sum(points for points, _, _ in results.values())
     possible = sum(possible for _, possible, _ in results.values())
     print(f"Together: {points:g} of {possible:g} points")
-    return 0 if points == possible else 1
+    return [{"exercise": number, "points": points, "possible": possible,
+             "said": " ".join(dict.fromkeys(sentences))}
+            for number, (points, possible, sentences) in results.items()]
 
 
 # --- Which cells ----------------------------------------------------------------------

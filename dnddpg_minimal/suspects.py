@@ -115,13 +115,13 @@ def _place(letter):
 def check(letter, name=None):
     """One sentence about the answer `name` for a letter. Tells no right answer.
 
-    Raises ValueError for a letter or a name that does not exist.
+    A misspelt name gets the list of names. Raises ValueError for an unknown letter.
     """
     _place(letter)
     if name is None:
         return "no answer yet"
     if name not in SUSPECTS:
-        raise ValueError(f"name={name!r}: expected one of {', '.join(SUSPECTS)}.")
+        return f"{name!r} is no suspect: expected one of {', '.join(SUSPECTS)}"
     if _hash(letter, name) == ANSWERS[letter]:
         return f"right: it {SUSPECTS[name][0]}"
     return f"not this one: {SUSPECTS[name][1]}"

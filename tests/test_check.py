@@ -205,3 +205,28 @@ def test_no_such_file_and_no_time_get_one_line_and_exit_code_2(tmp_path, capsys)
                   [EXERCISE, "--seconds", "0"]):
         assert main(["check", *map(str, words)]) == 2
         assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_several_notebooks_are_checked_and_their_points_collected(tmp_path, capsys):
+    import pandas as pd
+
+    two = handed_in(tmp_path), tmp_path / "empty.ipynb"
+    shutil.copy(EXERCISE, two[1])
+    broken = tmp_path / "broken.ipynb"
+    broken.write_text("no notebook", encoding="utf-8")
+    table = tmp_path / "points.csv"
+    assert check.main([str(two[0]), str(broken), str(two[1]), "--csv", str(table)]) == 2
+    said = capsys.readouterr().out
+    assert said.count("Together: ") == 2 and f"{broken}: left out." in said
+    rows = pd.read_csv(table)
+    assert rows.groupby("notebook").points.sum().to_dict() == {
+        str(two[0]): 14, str(two[1]): 0}
+    assert rows.groupby("notebook").possible.sum().tolist() == [14, 14]
+    assert rows.said[rows.points == 0].str.startswith("not done yet").all()
+
+
+def test_a_table_that_cannot_be_written_is_refused_before_the_work(tmp_path):
+    with pytest.raises(ValueError, match="there is no folder"):
+        check.main([str(tmp_path / "x.ipynb"), "--csv", str(tmp_path / "no" / "p.csv")])
+    with pytest.raises(ValueError, match="no notebook named"):
+        check.main([])
