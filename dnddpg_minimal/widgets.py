@@ -62,7 +62,7 @@ def panel(title, sliders, draw, size=(6.4, 2.9), lines=1, still=()):
     anew, over a copy of the rest.
     """
     texts = [ipywidgets.Label() for _ in range(lines)]
-    figure = Figure(figsize=size, dpi=90)  # without pyplot, which would keep it
+    figure = Figure(figsize=size)  # without pyplot, which would keep it
     picture = image_of(figure)
     canvas = FigureCanvasAgg(figure)
     drawn = {}  # the rest: the values of `still` it is drawn for, and its pixels
@@ -549,7 +549,7 @@ class LiveTraining(Panel):
             button.on_click(lambda _, act=act: act())
         self.progress = ipywidgets.IntProgress(max=config.steps, description="steps")
         self.text = ipywidgets.Label("Press start.")
-        self._figure = Figure(figsize=(7.4, 2.7), dpi=90)
+        self._figure = Figure(figsize=(7.4, 2.7))
         self.picture = image_of(self._figure)
         self._canvas = FigureCanvasAgg(self._figure)
         super().__init__([ipywidgets.HBox(buttons), self.progress, self.text,

@@ -1,5 +1,7 @@
 """Figures draw what they are given, and mean the same thing everywhere."""
 
+import re
+from pathlib import Path
 
 import matplotlib
 
@@ -27,6 +29,17 @@ def picture():
     q = truth[None] + 3
     q[0, 0, 0] -= 5
     return dict(x=x, y=y, q=q, truth=truth)
+
+
+def test_all_figures_grow_with_the_dots_of_the_page(monkeypatch):
+    """A lecturer sets one number; a figure with its own would stay small."""
+    for path in Path(plots.__file__).parent.glob("*.py"):
+        text = path.read_text(encoding="utf-8").replace("savefig(path, dpi=100)", "")
+        assert not re.search(r"\bdpi=\d", text), path.name
+    monkeypatch.setitem(plt.rcParams, "figure.dpi", 180)
+    steps = {"Pendulum-v1": {"DDPG": (np.arange(3), np.ones((2, 3)))}}
+    plots.plot_eight_tasks(steps)
+    assert plt.gcf().dpi == 140  # 70 on the page
 
 
 def test_each_algorithm_has_a_colour_and_a_kind_of_line_of_its_own():

@@ -15,6 +15,7 @@ from dnddpg_minimal.plots.style import (
     TWO,
     VALUES,
     pale,
+    small,
     thousands,
 )
 
@@ -174,7 +175,7 @@ def plot_reaching(tables, columns, references=None, log=(), axes=None, title="")
     """
     if axes is None:
         figure, axes = plt.subplots(len(tables), len(columns), figsize=(6, 3.1),
-                                    squeeze=False, sharex=True, dpi=75,
+                                    squeeze=False, sharex=True, dpi=small(75),
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for r, (task, table) in enumerate(tables.items()):
@@ -216,7 +217,7 @@ def plot_joint_errors(pictures, limit, axes=None, title=""):
     if axes is None:
         figure, axes = plt.subplots(rows, columns, sharex=True, sharey=True,
                                     figsize=(1.75 * columns + 1.2, 1.6 * rows + 0.5),
-                                    squeeze=False, layout="constrained", dpi=82)
+                                    squeeze=False, layout="constrained", dpi=small(82))
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for r, (task, maps) in enumerate(pictures.items()):
         for ax in axes[r, len(maps):]:

@@ -3,7 +3,16 @@
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dnddpg_minimal.plots.style import ONE, STYLE, THREE, TRUTH, TWO, pale, thousands
+from dnddpg_minimal.plots.style import (
+    ONE,
+    STYLE,
+    THREE,
+    TRUTH,
+    TWO,
+    pale,
+    small,
+    thousands,
+)
 
 FEWEST = 3  # runs for an interval, as in statistics.py
 VERDICTS = {  # first words of a verdict: colour of its field, colour of its text
@@ -27,7 +36,7 @@ def plot_eight_tasks(curves, interval=None, seeds=False, limits=None, xlabel="",
     if axes is None:
         rows = -(-len(curves) // 4)
         figure, axes = plt.subplots(rows, min(4, len(curves)), squeeze=False,
-                                    figsize=(7, 1.55 * rows + 0.4), dpi=70,
+                                    figsize=(7, 1.55 * rows + 0.4), dpi=small(70),
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
         figure.supxlabel(xlabel, fontsize=9)

@@ -13,6 +13,7 @@ from dnddpg_minimal.plots.style import (
     TWO,
     VALUES,
     draw_map,
+    small,
 )
 
 GOAL = 0.45  # position of the flag
@@ -27,7 +28,7 @@ def plot_energy_paths(x, y, energy, paths, ax=None, title=""):
     three; each begins at a ring and ends at a star.
     """
     if ax is None:
-        _, ax = plt.subplots(figsize=(6.2, 3.4), layout="constrained", dpi=75)
+        _, ax = plt.subplots(figsize=(6.2, 3.4), layout="constrained", dpi=small(75))
     ax.contour(x, y, energy, [0.1, 0.25, 0.5, 0.75], colors="0.8", linewidths=0.8,
                antialiased=False)
     goal_line(ax, x, y, energy)
@@ -62,7 +63,7 @@ def plot_pushes(cases, axes=None, title=""):
     if axes is None:
         height = 1.5 * len(cases) + 0.8
         figure, axes = plt.subplots(len(cases), 2, figsize=(7.4, height), sharex="col",
-                                    sharey="col", squeeze=False, dpi=75,
+                                    sharey="col", squeeze=False, dpi=small(75),
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for row, (label, (push, position)), style in zip(axes, cases.items(),
@@ -95,8 +96,8 @@ def plot_climbing(predicted, measured, best, usual, axes=None, title=""):
     best, usual: values of θ that are marked in both panels.
     """
     if axes is None:
-        figure, axes = plt.subplots(1, 2, figsize=(7.4, 2.8), sharex=True, dpi=75,
-                                    layout="constrained")
+        figure, axes = plt.subplots(1, 2, figsize=(7.4, 2.8), sharex=True,
+                                    dpi=small(75), layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     axes[0].plot(*predicted, color="black", linewidth=1.8)
     axes[0].axhline(1, color=GREY, linewidth=1)
@@ -159,9 +160,9 @@ def plot_found_or_not(pictures, axes=None, title=""):
     blue where it underestimates. The dotted line is the flag.
     """
     if axes is None:
-        figure, axes = plt.subplots(len(pictures), 3, sharex=True, sharey=True, dpi=75,
+        figure, axes = plt.subplots(len(pictures), 3, sharex=True, sharey=True,
                                     figsize=(7.6, 1.9 * len(pictures) + 0.8),
-                                    squeeze=False, layout="constrained")
+                                    dpi=small(75), squeeze=False, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for row, (label, picture) in zip(axes, pictures.items()):
         q, truth = picture["q"][0], picture["truth"]

@@ -21,6 +21,7 @@ from dnddpg_minimal.plots.style import (
     TRUTH,
     TWO,
     pale,
+    small,
 )
 
 CAMERA = dict(azimuth=90, elevation=-8)  # from the side, a little from above, degrees
@@ -235,7 +236,7 @@ def plot_live(episodes, evaluations, q, truth, random, axes=None, title=""):
     """
     if axes is None:
         figure, axes = plt.subplots(1, 2, figsize=(7.4, 3), layout="constrained",
-                                    width_ratios=(5, 4), dpi=80)
+                                    width_ratios=(5, 4), dpi=small(80))
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     plot_learning(episodes, evaluations, random, ax=axes[0])
     axes[0].legend(loc="upper left", fontsize=8)
@@ -277,7 +278,7 @@ def four_panels(rows=1, height=2.6, title=""):
     """
     # Few dots, and no smooth edges where lines are many: a small file
     figure, axes = plt.subplots(rows, 4, figsize=(7.6, height), sharex=True,
-                                squeeze=False, layout="constrained", dpi=72)
+                                squeeze=False, layout="constrained", dpi=small(72))
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     return figure, axes
 

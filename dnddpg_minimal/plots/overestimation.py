@@ -14,6 +14,7 @@ from dnddpg_minimal.plots.style import (
     TRUTH,
     TWO,
     draw_map,
+    small,
     thousands,
 )
 
@@ -125,7 +126,7 @@ def plot_error_and_share(pictures, limit, axes=None, title=""):
     """
     if axes is None:
         figure, axes = plt.subplots(2, len(pictures), figsize=(7, 3.2), sharex=True,
-                                    sharey=True, layout="constrained", dpi=70)
+                                    sharey=True, layout="constrained", dpi=small(70))
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for n, (step, picture) in enumerate(pictures.items()):
         error = picture["error"]
@@ -158,7 +159,7 @@ def plot_owed(table, owed, control, debt, axes=None, title=""):
     """
     if axes is None:
         figure, axes = plt.subplots(1, 2, figsize=(7.2, 2.7), layout="constrained",
-                                    width_ratios=(3, 2), dpi=70)  # a small file
+                                    width_ratios=(3, 2), dpi=small(70))  # a small file
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     ax, right = axes
     for name, runs in table.groupby("algorithm", sort=False):

@@ -11,6 +11,7 @@ from dnddpg_minimal.plots.style import (
     TRUTH,
     TWO,
     pale,
+    small,
     thousands,
 )
 
@@ -27,8 +28,8 @@ def plot_line_up(agents, axes=None, title=""):
     """
     rows = 2 * -(-len(agents) // 3)
     if axes is None:
-        figure, axes = plt.subplots(rows, 3, figsize=(7.6, 1.3 * rows + 0.8), dpi=72,
-                                    layout="constrained", squeeze=False)
+        figure, axes = plt.subplots(rows, 3, figsize=(7.6, 1.3 * rows + 0.8),
+                                    dpi=small(72), layout="constrained", squeeze=False)
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for n, (letter, agent) in enumerate(agents.items()):
         above, below = axes[2 * (n // 3):2 * (n // 3) + 2, n % 3]
@@ -84,7 +85,7 @@ def plot_practice(agents, axes=None, title=""):
     rows = -(-len(agents) // columns)
     if axes is None:
         figure, axes = plt.subplots(rows, columns, figsize=(7.8, 1.7 * rows + 0.5),
-                                    layout="constrained", squeeze=False, dpi=75)
+                                    layout="constrained", squeeze=False, dpi=small(75))
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     every = np.ravel(axes)
     for ax in every[len(agents):]:
@@ -113,7 +114,7 @@ def plot_questions(groups, axes=None, title=""):
     """
     widths = [len(agents) for agents in groups.values()]
     if axes is None:
-        figure, axes = plt.subplots(1, len(groups), figsize=(7.4, 2.9), dpi=75,
+        figure, axes = plt.subplots(1, len(groups), figsize=(7.4, 2.9), dpi=small(75),
                                     width_ratios=widths, squeeze=False,
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
