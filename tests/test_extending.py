@@ -1,6 +1,9 @@
 """A rule, an agent, a task of one's own: what a reader adds, the file unchanged."""
 
+import re
+import textwrap
 import warnings
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -162,3 +165,11 @@ def test_the_closed_forms_refuse_what_they_do_not_know():
     with pytest.raises(ValueError, match="no limit"):
         bias.accumulated(0.1, 1.0)
     assert np.isclose(bias.accumulated(0.1, 1.0, ends=0.5), 0.1)
+
+
+def test_the_rule_in_contributing_runs(capsys):
+    guide = Path(__file__).parents[1] / "CONTRIBUTING.md"
+    (block,) = re.findall(r"```python\n(.*?)```", guide.read_text(encoding="utf-8"),
+                          re.DOTALL)
+    exec(textwrap.dedent(block), {})
+    assert abs(float(capsys.readouterr().out.split()[-1])) < 1e-5
