@@ -130,6 +130,14 @@ def test_the_first_step_of_a_late_climb_is_as_long_as_adams_first_step():
     assert np.isclose(moved.max(), agent.config.actor_lr, rtol=1e-3)
 
 
+def test_a_file_from_before_the_actors_counted_counts_as_if_they_always_climbed():
+    agent = NumpyAgent(Config(**PENDULUM), 3, 1)
+    old = agent.arrays() | dict(updates=7)
+    del old["climbs"]
+    agent.set_arrays(old)
+    assert (agent.updates, agent.climbs) == (7, 7)
+
+
 class NoPictures(gym.Env):
     """A task whose maker never thought of pictures: no `render_mode`."""
 
