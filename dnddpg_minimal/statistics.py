@@ -352,14 +352,12 @@ def p_value(differences):
     differences (n,). Below 0.05 where the 95 % t interval leaves 0 out. NaN for fewer
     than three.
     """
-    from scipy.stats import ttest_1samp
-
     differences = np.asarray(differences, np.float64)
     if len(differences) < FEWEST:
         return np.nan
     if np.ptp(differences) == 0:  # all equal: sure, or nothing at all
         return float(differences[0] == 0)
-    return float(ttest_1samp(differences, 0).pvalue)
+    return float(stats.ttest_1samp(differences, 0).pvalue)
 
 
 def holm(p_values):

@@ -295,10 +295,11 @@ def test_fewer_than_three_runs_have_no_shade():
 def test_every_verdict_has_a_field_and_a_claim_about_no_task_has_none():
     table = {"one": {"Pendulum-v1": st.HOLDS, "Hopper-v5": st.FAILS},
              "two": {"Pendulum-v1": st.OPEN, "Hopper-v5": "not tested (n = 1)"},
-             "three": {"Hopper-v5": st.UNTESTED}}
+             "three": {"Pendulum-v1": f"{st.HOLDS} alone", "Hopper-v5": st.UNTESTED}}
     ax = plots.plot_verdicts(table, ["Pendulum-v1", "Hopper-v5"])
-    assert [text.get_text() for text in ax.texts] == ["holds", "does not", "open",
-                                                      "n = 1", "too short"]
+    assert [text.get_text() for text in ax.texts] == [
+        "holds", "does not", "open", "n = 1", "holds alone", "too short"]
+    assert len({patch.get_facecolor() for patch in ax.patches}) == 5
 
 
 @pytest.mark.usefixtures("close_figures")

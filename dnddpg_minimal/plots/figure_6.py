@@ -16,7 +16,9 @@ from dnddpg_minimal.plots.style import (
 
 FEWEST = 3  # runs for an interval, as in statistics.py
 VERDICTS = {  # first words of a verdict: colour of its field, colour of its text
+    "holds alone": ("#B3D4E8", "black"),  # not after correction for all questions
     "holds": ("#0072B2", "white"),
+    "does not hold alone": ("#F2CDB3", "black"),
     "does not hold": ("#D55E00", "white"),
     "not distinguishable": ("#DDDDDD", "black"),
     "not tested": ("white", "0.35"),
@@ -191,7 +193,8 @@ def plot_verdicts(table, tasks, ax=None, title=""):
     """The verdicts as a table: a row per claim, a column per task of `tasks`.
 
     table: a dict from a claim to a dict from a task to a verdict (statistics.verdict);
-    a claim that does not speak of a task leaves its field empty.
+    a claim that does not speak of a task leaves its field empty. A verdict that a
+    correction for many questions takes away again has " alone" at its end, and is pale.
     """
     if ax is None:
         figure, ax = plt.subplots(figsize=(7.8, 0.7 + 0.33 * len(table)),
