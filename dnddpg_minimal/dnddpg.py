@@ -426,8 +426,8 @@ def forward(layers, x):
     ReLU after every layer but the last; h (N, B, H + 1), z (N, B, out).
     """
     activations = [x]
-    # x may lack the axes in front (N,), or have others than the layers: broadcast
-    lead = np.broadcast_shapes(x.shape[:-2], layers[0].shape[:-2])
+    # The axes in front, (N,): x may lack them, or have others than the layers
+    lead = np.broadcast(x[..., :1, 0], layers[0][..., :1, 0]).shape[:-1]
     for layer in layers[:-1]:
         h = np.empty((*lead, x.shape[-2], layer.shape[-1] + 1), x.dtype)
         h[..., -1] = 1
