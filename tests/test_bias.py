@@ -12,6 +12,7 @@ from dnddpg_minimal import (
     arm,
     make_agent,
     make_env,
+    next_value,
     probes,
     stream,
     td_target,
@@ -43,6 +44,9 @@ class FakeAgent:
     def q_next(self, obs):
         q = self.q_values(obs, self.act(obs))  # (C, B)
         return np.repeat(q[:, None], self.config.actors, axis=1)
+
+    def next_value(self, q_next):
+        return next_value(q_next, self.config.target_rule, self.config.nu)
 
 
 def fake_training(agent, kept=(), step=1000):
@@ -617,6 +621,7 @@ def test_the_operators_numbers_are_found_in_planted_errors():
     agent = types.SimpleNamespace(
         config=config,
         q_next=lambda obs: truth + e,
+        next_value=lambda q_next: next_value(q_next, config.target_rule),
         actions=lambda obs: np.array([np.zeros((n, 2)), np.full((n, 2), 0.3)]),
     )
     found = instrument.measure_operator(agent, np.zeros((n, 3)), truth)
