@@ -55,6 +55,8 @@ def test_the_readme_gives_two_complete_commands_of_one_line_each():
         assert command.startswith("python3 -m venv .venv && ")
         assert "pip install -r requirements.txt" in command
     assert read.split("&& ")[-1].split()[-1] == "notebooks/00_start_here.ipynb"
+    # Else JupyterLab sees notebooks/ only: no films, no links to the exercises
+    assert "-m jupyterlab --ServerApp.root_dir=. " in read
     assert "pytest --nbval" in check
 
 
