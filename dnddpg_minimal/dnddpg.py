@@ -679,6 +679,7 @@ class Agent:
     def td_target(self, batch):
         """y (B,) of a batch. No gradient flows through it."""
         value = self.next_value(self.q_next(batch.next_obs))
+        # As one critic's and one actor's, (1, 1, B): no rule changes a single value
         return td_target(batch.reward, batch.terminated, value[None, None],
                          self.config.gamma, y_min=self.config.y_min)
 
