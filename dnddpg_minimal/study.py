@@ -137,8 +137,9 @@ def _paper():
 def _class():
     from dnddpg_minimal.bugs import ABLATIONS, BUGS
 
-    pendulum, arm, car, cheetah = TASKS[:1], TASKS[1:2], TASKS[3:4], MUJOCO_TASKS[:1]
-    hopper, walker, others = MUJOCO_TASKS[1:2], MUJOCO_TASKS[2:3], MUJOCO_TASKS[3:]
+    pendulum, arm, hard, car = TASKS[:1], TASKS[1:2], TASKS[2:3], TASKS[3:4]
+    cheetah, hopper = MUJOCO_TASKS[:1], MUJOCO_TASKS[1:2]
+    walker, others = MUJOCO_TASKS[2:3], MUJOCO_TASKS[3:]
     ddpg, dcn, dn = ("DDPG",), ("DCN-DDPG",), ("DN-DDPG",)
     short = dict(steps=20_000)
     slow = dict(tau=0.01, target_every=10)
@@ -169,7 +170,8 @@ def _class():
     runs += _many(5, arm, dn, "bonus", task_options=bonus, gamma=0.99)
     # Controls: networks as many weights as DN's, twice the updates, frozen actors
     runs += _many(10, pendulum, ddpg, "hidden=92-92", hidden=(92, 92))
-    runs += _many(10, pendulum, dcn, "updates_per_step=2", updates_per_step=2)
+    runs += _many(10, hard, ddpg, "hidden=184-184", hidden=(184, 184))
+    runs += _many(10, (*pendulum, *hard), dcn, "updates_per_step=2", updates_per_step=2)
     runs += _many(10, pendulum, ALGORITHMS, "frozen", freeze_actors_after=20_000)
     runs += _many(1, (*cheetah, *hopper), ALGORITHMS, "frozen", **frozen)
     runs += _many(1, (*walker, *others), dn, "frozen", **frozen)
