@@ -89,10 +89,21 @@ def try_out(config):
                          ) from error
 
 
+def described(config):
+    """One line: what a run of this config is, presets filled in."""
+    end = (f"{config.steps:,} steps" if config.episodes is None else
+           f"{config.episodes:,} episodes")
+    layers = "-".join(map(str, config.hidden))
+    return (f"{config.algorithm} on {config.task}, seed {config.seed}: {end}, layers "
+            f"{layers}, batch {config.batch_size}, γ {config.gamma:g}, τ "
+            f"{config.tau:g}, {config.noise} noise {config.sigma:g}")
+
+
 def run(training, out):
     """Go on with a training to its end, or to Ctrl-C; save it to `out` → exit code."""
     go_on = command("train --resume", out)
     saved_at = time.monotonic()
+    print(described(training.config))
     scale = dict(total=training.config.steps, initial=training.step, unit=" steps")
     with Interrupt() as interrupt, tqdm(**scale) as bar:
         try:

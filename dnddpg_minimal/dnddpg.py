@@ -39,6 +39,7 @@ import math
 import os
 import re
 import warnings
+from copy import copy
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from numbers import Integral, Real
@@ -101,11 +102,10 @@ def _not_allowed(name, value, choices):
 
 def _number(name, value, low, high):
     """`value` as a plain int or float. ValueError if it is not within the limits."""
-    whole = isinstance(low, int)
-    of_kind = isinstance(value, Integral if whole else Real)
-    if of_kind and not isinstance(value, bool) and low <= value <= high:
-        return int(value) if whole else float(value)
-    words = "a whole number" if whole else "a number"
+    kind = Integral if isinstance(low, int) else Real
+    if isinstance(value, kind) and not isinstance(value, bool) and low <= value <= high:
+        return type(low)(value)
+    words = "a whole number" if kind is Integral else "a number"
     lowest = "above 0" if low == _ABOVE_0 else f"{low:g} or more"
     highest = "" if high == math.inf else f", at most {high:g}"
     raise ValueError(f"{name}={value!r} is not allowed: expected {words}, "
@@ -580,7 +580,8 @@ class Agent:
 
     Observations are (B, O), actions (B, A) in [-1, 1]; NumPy arrays in and out.
     `slow=True` asks the slow copies instead of the networks that learn. obs_dim is O,
-    action_dim is A: the widths that the networks get.
+    action_dim is A: the widths that the networks get. `theta` is the vector of all
+    weights (`Config.theta` is another thing: the pull of the noise).
 
     Each agent adds the two halves of an update, `fit_critics` and `climb_critics`, and
     what they need: `_array` and `_numpy` turn NumPy's arrays into its own and back,
@@ -613,7 +614,7 @@ class Agent:
     def arrays(self):
         """All that learning changes, as copies: STATE, each (size,), and `updates`."""
         state = {name: self._numpy(getattr(self, name)) for name in self.STATE}
-        return state | dict(updates=self.updates, climbs=self.climbs)
+        return state | dict(updates=self.updates, climbs=self.actor_updates)
 
     def set_arrays(self, arrays):
         """Go on from the `arrays` of either agent. ValueError if shapes differ."""
@@ -623,7 +624,7 @@ class Agent:
                                  f"({self.size},)")
             setattr(self, name, self._array(arrays[name]))
         self.updates = int(arrays["updates"])
-        self.climbs = int(arrays.get("climbs", self.updates))  # an old file has none
+        self.actor_updates = int(arrays.get("climbs", self.updates))  # not in old files
         self.critic, self.actor = self.cut(self.theta)
         self.critic_target, self.actor_target = self.cut(self.theta_target)
         self._prepare()
@@ -698,7 +699,7 @@ class Agent:
         losses = {"critic": self.fit_critics(batch, y),  # Eq. (3)
                   "actor": np.full(config.actors, np.nan)}
         if climb:
-            self.climbs += 1
+            self.actor_updates += 1
             losses["actor"] = self.climb_critics(batch)  # Eq. (4)
         if self.updates % config.target_every == 0:  # Eq. (1)
             self.theta_target += config.tau * (self.theta - self.theta_target)
@@ -770,7 +771,7 @@ class NumpyAgent(Agent):
         daction = backward(critic, activations, dq, inputs=slice(self.obs_dim, -1))
         daction *= 1 - action * action  # through tanh
         backward(self.actor, hidden, daction, self.dactor)
-        self._adam(slice(self.split, None), self.climbs, self.config.actor_lr)
+        self._adam(slice(self.split, None), self.actor_updates, self.config.actor_lr)
         return activations[-1][..., 0].sum(axis=1) / -size
 
     def _adam(self, part, t, lr):
@@ -802,7 +803,7 @@ class TorchAgent(Agent):
     def _prepare(self):
         config = self.config
         parts = zip((self.critic, self.actor), self.cut(self.adam_m),
-                    self.cut(self.adam_v), (self.updates, self.climbs),
+                    self.cut(self.adam_v), (self.updates, self.actor_updates),
                     (config.critic_lr, config.actor_lr), strict=True)
         self.critic_adam, self.actor_adam = (self._adam(*part) for part in parts)
 
@@ -974,6 +975,7 @@ class Training:
     A subclass may name an agent of its own as its `agent_class`.
     """
 
+    SMALL = ("step", "episode", "keep_at", "records", "kept", "first_losses")
     agent_class = staticmethod(make_agent)
 
     def __init__(self, config):
@@ -1001,9 +1003,8 @@ class Training:
     @property
     def finished(self):
         """True when the run's last step, or its last episode, is done."""
-        if self.config.episodes is None:
-            return self.step >= self.config.steps
-        return self.episode >= self.config.episodes
+        steps, episodes = self.config.steps, self.config.episodes
+        return self.step >= steps if episodes is None else self.episode >= episodes
 
     def __iter__(self):
         return self
@@ -1108,15 +1109,11 @@ class Training:
     # not: its rows that are overwritten afterwards are noted, and put back in the file.
 
     def _remember(self):
-        self._overwritten = []
-        self._arrays = self.agent.arrays()
-        self._small = dict(
-            step=self.step, episode=self.episode, keep_at=self.keep_at,
-            noise_scale=self.noise.scale, records=self.records.copy(),
-            kept=self.kept.copy(), first_losses=self.first_losses.copy(),
-            agent=type(self.agent).__name__,
-            streams={role: rng.bit_generator.state
-                     for role, rng in self.streams.items()})
+        self._overwritten, self._arrays = [], self.agent.arrays()
+        streams = {role: rng.bit_generator.state for role, rng in self.streams.items()}
+        self._small = {name: copy(getattr(self, name)) for name in self.SMALL} | dict(
+            noise_scale=self.noise.scale, agent=type(self.agent).__name__,
+            streams=streams)
 
     def _store(self, *transition):
         """Into replay; what it overwrites is noted until the episode's end."""
@@ -1158,9 +1155,9 @@ class Training:
         if small.get("agent", mine) != mine:
             raise ValueError(f"its agent is a {small['agent']}, and this Training's a "
                              f"{mine}")
-        for name in ("step", "episode", "keep_at", "kept", "first_losses"):
+        for name in self.SMALL:
             setattr(self, name, small[name])
-        self.records = [Record(*record) for record in small["records"]]
+        self.records = [Record(*record) for record in self.records]
         self.noise.scale = small["noise_scale"]
         for role, rng in self.streams.items():
             rng.bit_generator.state = small["streams"][role]
