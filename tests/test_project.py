@@ -291,3 +291,18 @@ def test_a_chapter_calls_the_others_by_their_names(notebook):
         assert path.exists(), target
         if re.match(r"\d\d ", words) and path.parent == notebook.parent:
             assert " ".join(words.split()) == title_of(path)
+
+
+def test_the_algorithm_is_as_short_as_the_reading_guides_say():
+    """README and chapter 00: sections 3 to 6, up to PyTorch's agent: 270 lines."""
+    text = (ROOT / "dnddpg_minimal" / "dnddpg.py").read_text(encoding="utf-8")
+    code = {number for number, line in enumerate(text.splitlines(), 1)
+            if line.strip() and not line.strip().startswith("#")}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            first = node.body[0]
+            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
+                code -= set(range(first.lineno, first.end_lineno + 1))  # docstrings
+    begin, end = (text[:text.index(mark)].count("\n")
+                  for mark in ("# --- 3.", "class TorchAgent"))
+    assert sum(begin < number <= end for number in code) == pytest.approx(270, abs=10)
