@@ -53,6 +53,9 @@ def test_the_order_of_the_rows_does_not_matter():
 def test_spread_is_the_mean_distance_from_the_middle_run():
     rows = table(DDPG_0=[0, 0], DDPG_1=[1, 10], DDPG_2=[5, 12])  # middle: 1 and 10
     assert st.scores(rows, "spread").tolist() == [5.5, 0, 3]
+    alone = rows.assign(task="Hopper-v5")  # a task that fewer algorithms have done
+    both = pd.concat([rows, rows.assign(algorithm="DN-DDPG"), alone])
+    assert st.scores(both, "spread")["Hopper-v5"].tolist() == [5.5, 0, 3]
 
 
 def test_an_unknown_kind_of_score_is_refused_by_name():
@@ -174,6 +177,7 @@ def test_random_is_zero_and_the_reference_is_one():
 def test_the_interquartile_mean_rounds_down_what_it_cuts_off():
     assert st.interquartile_mean([1, 2, 9]) == 4  # nothing
     assert st.interquartile_mean([1, 2, 3, 4, 100]) == 3  # one at each end
+    assert st.interquartile_mean([0, 0, 3, 3, 5, 5, 99, 99]) == 4  # two: a quarter
     assert st.interquartile_mean([0, 0, 3, 3, 3, 5, 5, 5, 99, 99]) == 4  # two
 
 
@@ -183,6 +187,11 @@ def test_the_interval_over_tasks_draws_runs_and_never_tasks():
     assert iqm == low == high == 0.5
     iqm, low, high = st.iqm_interval([np.zeros(2), np.ones(3)])
     assert np.isnan([low, high]).all()
+
+
+def test_the_interval_over_tasks_never_leaves_the_runs_however_skewed_they_are():
+    iqm, low, high = st.iqm_interval([[0, 0, 0, 0, 10, 10]])
+    assert 0 <= low < iqm < high <= 10  # percentiles of means that were drawn
 
 
 def test_a_task_with_more_runs_does_not_count_more():
@@ -217,6 +226,8 @@ def test_a_curve_that_still_climbs_is_not_settled():
         rows["step"] *= 400  # to 40 000, a fifteenth of the paper's
         assert st.settled(rows, "Pendulum-v1") is rests
         assert st.tested(rows, "Pendulum-v1") is rests
+        rows["step"] *= 7.5  # to half of the paper's: no matter whether it rests
+        assert st.tested(rows, "Pendulum-v1")
     assert not st.tested(rows, "Hopper-v5")  # nothing recorded
 
 
