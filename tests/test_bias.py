@@ -785,6 +785,18 @@ def test_a_summary_says_mean_standard_error_and_n():
     assert np.isnan(instrument.summary([1.0])[1])
 
 
+@pytest.mark.parametrize("limit", [2, 3])
+def test_an_end_counts_within_the_time_limit_only_and_leaves_no_tail(limit):
+    """At full force from here the car is at the flag after its third step."""
+    world = instrument.dynamics(Config("MountainCarContinuous-v0",
+                                       max_episode_steps=limit))
+    found = instrument.rollout(world, np.array([[0.3, 0.07]]),
+                               lambda obs: np.ones((len(obs), 1)), 0.99)
+    assert found["ended"].item() == (limit == 3)
+    assert found["truth"].item() == pytest.approx(-0.1 - 0.099 + 0.99**2 * 99.9)
+    assert found["tail"] == 0  # nothing more can be earned
+
+
 @pytest.mark.parametrize("limit, in_time", [(50, False), (200, True)])
 def test_a_flag_after_the_time_limit_is_in_the_truth_and_no_success(limit, in_time):
     config = Config("MountainCarContinuous-v0", max_episode_steps=limit)

@@ -844,6 +844,14 @@ def test_adams_second_step_by_hand():
     np.testing.assert_allclose(descend([1, 2]), -0.1 - 0.1 * step, rtol=1e-7)
 
 
+def test_adam_drops_only_what_has_faded_to_nothing():
+    """Every 256 steps, and far below what any gradient still means."""
+    m = np.array([1e-20, 1e-30])
+    for t, left in ((255, [0.9e-20, 0.9e-30]), (256, [0.81e-20, 0])):
+        adam(np.zeros(2), np.zeros(2), m, np.ones(2), t, 0.1)
+        np.testing.assert_allclose(m, left, rtol=1e-12)
+
+
 def test_adams_eps_stands_outside_the_square_root():
     """A gradient as small as eps goes half a step; inside the root it would go 1e-4."""
     np.testing.assert_allclose(descend([1e-8]), -0.05, rtol=1e-9)
