@@ -103,7 +103,7 @@ def run(training, out):
     """Go on with a training to its end, or to Ctrl-C; save it to `out` → exit code."""
     go_on = command("train --resume", out)
     saved_at = time.monotonic()
-    print(described(training.config))
+    print(described(training.config), file=sys.stderr)  # where the bar is
     scale = dict(total=training.config.steps, initial=training.step, unit=" steps")
     with Interrupt() as interrupt, tqdm(**scale) as bar:
         try:

@@ -52,6 +52,7 @@ from .dnddpg import (
     choose_actor,
     is_mujoco,
     make_env,
+    simulator_state,
     stream,
     to_env,
 )
@@ -219,6 +220,23 @@ class Simulator(Dynamics):
         size = mujoco.mj_stateSize(self.model, self.integration)
         self.cuts = size, size + self.data.xipos.size  # state | xipos | obs
 
+    def repeats(self):
+        """Does a state that was put back go on to the last bit as it did?
+
+        The book's four tasks do. Another task's reward may read more of the simulator
+        (Ant's reads `xpos`), or a wrapper may change what the task says.
+        """
+        action = np.full((1, *self.space.shape), 0.3)
+        self.env.reset(seed=1)
+        for _ in range(3):
+            obs = self.env.step(to_env(action[0], self.space))[0]
+        state, xipos = simulator_state(self.env)
+        states = self.pack([dict(state=state, xipos=xipos, obs=obs)])
+        obs, reward = self.env.step(to_env(action[0], self.space))[:2]
+        self.env.reset(seed=2)
+        again, repeated, _ = self.step(states, action)
+        return reward == repeated[0] and np.array_equal(obs, again[0, self.cuts[1] :])
+
     def pack(self, kept):
         """The rows of what `Training.kept` holds: (N, S)."""
         rows = [(k["state"], k["xipos"].ravel(), k["obs"]) for k in kept]
@@ -356,7 +374,7 @@ def walk(env, policy, seed, steps):
     obs, _ = env.reset(seed=int(seed))
     observations, actions, rewards = [], [], []
     for _ in range(steps):
-        observations.append(np.asarray(obs, np.float32))
+        observations.append(np.array(obs, np.float32))  # a copy
         actions.append(policy(observations[-1]))
         action = to_env(actions[-1], env.action_space)
         obs, reward, terminated, truncated, _ = env.step(action)
@@ -572,19 +590,20 @@ def _by_episodes(agent, common, rng, kept, full):
     it in the same episode; the time limit is passed over, so that at least 500 steps
     follow, or a real end. The episode is the unit: n counts episodes, q and truth are
     means over an episode's states, and standard errors are over episodes.
-    Kept states: n counts states, and standard errors are over states.
+    Kept states: n counts states, and standard errors are over states; NaN on a task
+    that cannot be put back (`Simulator.repeats`).
     """
     config = agent.config
-    env = make_env(config)
-    limit = env.spec.max_episode_steps or 2 * STEPS
-    # The time limit is bypassed; we count the steps of a return ourselves.
-    endless = env.env if isinstance(env, gymnasium.wrappers.TimeLimit) else env
+    limit = (config.max_episode_steps
+             or gymnasium.spec(config.task).max_episode_steps or 2 * STEPS)
+    # No time limit in our way; we count the steps of a return ourselves.
+    env = make_env(dataclasses.replace(config, max_episode_steps=10**9))
     simulator = is_mujoco(env)
 
     returns, q_means, truth_means, largest = [], [], [], 0.0
     episodes = EPISODES_MUJOCO if simulator else EPISODES_OTHER
     for seed in rng.integers(2**31, size=episodes):
-        walked = walk(endless, agent.act, seed, max(limit, 2 * STEPS))
+        walked = walk(env, agent.act, seed, max(limit, 2 * STEPS))
         obs, action, reward, terminated = walked
         returns.append(reward[:limit].sum())
         largest = max(largest, np.abs(reward).max())
@@ -620,6 +639,8 @@ def _by_episodes(agent, common, rng, kept, full):
 def _truth_of_kept(agent, kept, actions):
     """Q^pi of N kept MuJoCo states at each of some actions (N, A): a dict of (N,)."""
     world = Simulator(agent.config)
+    if not world.repeats():
+        return {name: np.full(len(kept), np.nan) for name in actions}
     states = np.concatenate([world.pack(kept)] * len(actions))
     first_action = np.concatenate(list(actions.values()))
     gamma = agent.config.gamma
@@ -832,7 +853,8 @@ def predict(sigma, kappa, rho, rule, nu=0.1, critics=2, actors=2):
     if critics > 2 or actors > 2:
         raise ValueError(f"critics={critics}, actors={actors}: the closed forms know "
                          "two of each at most.")
-    kappa, rho = (1.0 if np.isnan(c) else c for c in (kappa, rho))
+    # Measured correlations may lie a rounding beyond 1
+    kappa, rho = (1.0 if np.isnan(c) else np.clip(c, -1, 1) for c in (kappa, rho))
     forms = {
         "single": lambda: min_of_two_critics(kappa),
         "paired_min": lambda: paired_min(kappa, rho),

@@ -904,6 +904,9 @@ def make_env(config, render_mode=None):
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
             raise ValueError(f"{named} has {name} {space}: expected a flat Box of "
                              "numbers (continuous, one axis).")
+    if not np.issubdtype(env.action_space.dtype, np.floating):
+        raise ValueError(f"{named} has actions of {env.action_space.dtype}: expected "
+                         "floating point numbers.")
     if not env.action_space.is_bounded():
         raise ValueError(f"{named} has unbounded actions {env.action_space}: expected "
                          "finite bounds, since actors end in tanh.")
@@ -925,7 +928,7 @@ def simulator_state(env):
     if not is_mujoco(env):
         try:
             state = np.array(getattr(inner, "state", ()), float).ravel()
-        except (TypeError, ValueError):  # something else is called `state` there
+        except Exception:  # something else is called `state` there
             state = np.empty(0)
         return state, np.empty((0, 3))
     import mujoco
@@ -1024,7 +1027,7 @@ class Training:
         while not self.finished:
             seed = int(self.streams["environment"].integers(2**31))
             obs, _ = self.env.reset(seed=seed)
-            self._check(obs)
+            obs = self._checked(obs)
             self.noise.reset()
             self._return, self._length, over = 0.0, 0, False
             self._losses = [np.zeros(count, self.agent.dtype)  # sums
@@ -1051,7 +1054,7 @@ class Training:
         self.step += 1
         next_obs, reward, terminated, truncated, _ = self.env.step(
             to_env(action, self.env.action_space))
-        self._check(next_obs, reward)
+        next_obs = self._checked(next_obs, reward)
         over = bool(terminated or truncated)
         end = {"terminated": terminated, "none": False, "any_end": over}[config.ends]
         self._store(obs, action, reward, next_obs, end)
@@ -1062,11 +1065,13 @@ class Training:
                 self._update()
         return next_obs, over
 
-    def _check(self, obs, reward=0.0):
+    def _checked(self, obs, reward=0.0):
+        """A copy of obs, since a task may hand out its own state and change it."""
         if not (abs(reward) < LARGEST and (np.abs(obs) < LARGEST).all()):  # nor is NaN
             raise ValueError(f"step {self.step} of {self.config.task!r}: reward "
                              f"{reward!r}, observation {obs!r}: expected finite "
                              f"numbers below {LARGEST:g}.")
+        return np.array(obs)
 
     def _explore(self, obs):
         """The action to execute, (A,): uniform at first, then greedy + noise."""
@@ -1109,11 +1114,12 @@ class Training:
     # not: its rows that are overwritten afterwards are noted, and put back in the file.
 
     def _remember(self):
-        self._overwritten, self._arrays = [], self.agent.arrays()
         streams = {role: rng.bit_generator.state for role, rng in self.streams.items()}
-        self._small = {name: copy(getattr(self, name)) for name in self.SMALL} | dict(
+        small = {name: copy(getattr(self, name)) for name in self.SMALL} | dict(
             noise_scale=self.noise.scale, agent=type(self.agent).__name__,
             streams=streams)
+        arrays = self.agent.arrays()  # an interrupt up to here leaves the old three
+        self._overwritten, self._arrays, self._small = [], arrays, small
 
     def _store(self, *transition):
         """Into replay; what it overwrites is noted until the episode's end."""

@@ -13,6 +13,7 @@ A record is one small file: recordings/<task>/<variant>/<algorithm>-<seed>.npz.
 | `write_readme(folder)` | the same, put into recordings/README.md |
 """
 
+import glob
 import json
 import warnings
 from collections import Counter
@@ -25,9 +26,11 @@ import numpy as np
 from dnddpg_minimal import bias
 from dnddpg_minimal.dnddpg import (
     ALGORITHMS,
+    CHOICES,
     MUJOCO_TASKS,
     Config,
     _nearest,
+    _not_allowed,
     make_agent,
 )
 
@@ -78,14 +81,19 @@ def load_study(task=None, algorithm=None, variant="class", what="evaluations",
     """
     if what not in WHAT:
         raise ValueError(f"what={what!r}: expected one of {', '.join(WHAT)}.")
+    if rule not in (None, *CHOICES["act_rule"]):
+        raise ValueError(_not_allowed("rule", rule, CHOICES["act_rule"]))
     found = []
-    pattern = f"{task or '*'}/{variant or '*'}/{algorithm or '*'}-*.npz"
-    for path in Path(folder or RECORDINGS).glob(pattern):
+    names = [glob.escape(name) if name else "*" for name in (task, variant, algorithm)]
+    for path in Path(folder or RECORDINGS).glob("{}/{}/{}-*.npz".format(*names)):
+        if algorithm not in (None, path.stem.rpartition("-")[0]):
+            continue  # "DN" is not "DN-DDPG"
         try:
             found += _read(path, what, rule)
         except Exception as error:  # zipfile and NumPy raise a dozen kinds
             warnings.warn(f"{path} is skipped: it is damaged, or no record of this "
-                          f"study ({type(error).__name__}: {error})", stacklevel=2)
+                          f"study ({type(error).__name__}: {error}). Delete it, and "
+                          "`study` makes it again.", stacklevel=2)
     if not found:
         _refuse_unknown(folder, task=task, variant=variant, algorithm=algorithm)
     found.sort(key=lambda one: _order(*(one[name] for name in RUN)))

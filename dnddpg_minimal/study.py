@@ -629,7 +629,8 @@ def _start_worker(stop, nice):
     code(), revision()  # now: the files may change while we run
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the study hears Ctrl-C, and tells
     if hasattr(os, "nice"):
-        os.nice(nice)
+        with suppress(OSError):  # below 0 needs a right
+            os.nice(nice)
 
     def follow():
         parent_process().join()  # also a study that was killed
@@ -781,6 +782,8 @@ def command(
         readme: only write the tables as measured into the folder's README.md.
         films: only film the recorded agents that the book shows.
     """
+    if workers < 1:
+        raise ValueError(f"workers={workers}: expected 1 or more.")
     if readme:
         write_readme(folder)
         return 0

@@ -182,3 +182,88 @@ def test_the_rule_in_contributing_runs(capsys):
                           re.DOTALL)
     exec(textwrap.dedent(block), {})
     assert abs(float(capsys.readouterr().out.split()[-1])) < 1e-5
+
+
+class InPlace(gym.Env):
+    """A task that hands out its own state, and changes it in place."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.own = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        return self.out(), {}
+
+    def step(self, action):
+        self.own += 0.1 * float(action[0])
+        return self.out(), float(self.own.sum()), False, False, {}
+
+    def out(self):
+        return self.own
+
+
+class Copying(InPlace):
+    def out(self):
+        return self.own.copy()
+
+
+class Untouched(gym.Wrapper):
+    """A wrapper that changes nothing; Gymnasium puts it around the time limit."""
+
+
+def registered(name, task, **options):
+    if name not in gym.registry:
+        gym.register(name, task, max_episode_steps=50, **options)
+    return Training(Config(name, "DDPG", steps=200, warmup=100, hidden=(8,),
+                           batch_size=8))
+
+
+def test_a_task_that_changes_its_own_observation_in_place_is_learned_as_any_other():
+    found = []
+    for name, task in (("InPlace-v0", InPlace), ("Copying-v0", Copying)):
+        training = registered(name, task)
+        list(training)
+        obs, *_ = bias.walk(training.env, training.agent.act, seed=0, steps=50)
+        found.append((*(array.copy() for array in training.replay.arrays), obs))
+    for mine, theirs in zip(*found, strict=True):
+        assert np.array_equal(mine, theirs)
+    assert not np.array_equal(found[0][0], found[0][3])  # obs, next_obs
+
+
+def test_the_truth_looks_past_a_time_limit_inside_another_wrapper():
+    wrapper = (gym.envs.registration.WrapperSpec("Untouched", f"{__name__}:Untouched",
+                                                 {}),)
+    truths = []
+    for name, options in (("Plain-v0", {}),
+                          ("Wrapped-v0", dict(additional_wrappers=wrapper))):
+        training = registered(name, Copying, **options)
+        list(training)
+        row, *_ = bias.evaluate(training, full=False).bias
+        truths.append((row["truth"], row["n"]))
+    assert truths[0] == truths[1] and truths[0][1] == 10
+
+
+@pytest.mark.parametrize("task, repeats", [("Hopper-v5", True), ("Ant-v5", False)])
+def test_kept_states_that_cannot_be_put_back_have_no_truth(task, repeats):
+    training = Training(Config(task, "DDPG", steps=400, warmup=300, hidden=(8,),
+                               batch_size=8))
+    list(training)
+    found = bias.evaluate(training, full=True)
+    kept = [row["truth"] for row in found.bias if row["states"] == "recent"]
+    assert kept and np.isfinite(kept).all() == repeats
+    assert bias.Simulator(training.config).repeats() == repeats
+
+
+def test_actions_that_are_whole_numbers_are_refused():
+    class Whole(InPlace):
+        action_space = gym.spaces.Box(-128, 127, (1,), np.int8)
+
+    with pytest.raises(ValueError, match="int8"):
+        registered("Whole-v0", Whole)
+
+
+def test_a_correlation_a_rounding_above_one_predicts_as_one():
+    above = np.nextafter(1.0, 2)
+    assert bias.predict(1.0, above, above, "max_min") == bias.predict(
+        1.0, 1.0, 1.0, "max_min")

@@ -709,6 +709,9 @@ def test_the_readme_gets_its_tables_and_keeps_its_words(tmp_path, monkeypatch):
 def test_a_name_that_nobody_planned_is_refused_and_a_planned_one_is_empty(tmp_path):
     for asked, words in ((dict(task="Pendulum"), "Did you mean 'Pendulum-v1'"),
                          (dict(algorithm="TD3"), "algorithm='TD3'"),
+                         (dict(algorithm="DN"), "algorithm='DN'"),  # no part of a name
+                         (dict(variant="bug=*"), "variant='bug=.'"),  # no pattern
+                         (dict(rule="max-min"), "rule='max-min'"),
                          (dict(variant="target_rule=sinlge"), "target_rule=single")):
         with pytest.raises(ValueError, match=words):
             study.load_study(**asked)

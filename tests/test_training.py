@@ -71,6 +71,32 @@ def assert_same_run(first, second, tmp_path):
         np.testing.assert_array_equal(b[name], array, err_msg=name)
 
 
+# --- an interrupt ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("call", range(2, 6))
+def test_an_interrupt_while_an_episodes_end_is_noted_leaves_the_one_before(
+        call, monkeypatch, tmp_path):
+    choices = dict(buffer_size=30)  # an episode overwrites most of it
+    training = Training(Config(**PENDULUM, **choices))
+    arrays, calls = training.agent.arrays, []
+
+    def interrupted():
+        calls.append(1)
+        if len(calls) == call:
+            raise KeyboardInterrupt
+        return arrays()
+
+    monkeypatch.setattr(training.agent, "arrays", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        list(training)
+    monkeypatch.undo()
+    training.save(tmp_path / "run.npz")
+    resumed = Training.load(tmp_path / "run.npz")
+    list(resumed)
+    assert_same_run(resumed, run(**choices)[0], tmp_path)
+
+
 # --- the same seed, the same history --------------------------------------------------
 
 
