@@ -978,6 +978,7 @@ class Training:
     A subclass may name an agent of its own as its `agent_class`.
     """
 
+    # What a file holds beside weights, replay and random streams
     SMALL = ("step", "episode", "keep_at", "records", "kept", "first_losses")
     agent_class = staticmethod(make_agent)
 
