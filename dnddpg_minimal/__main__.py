@@ -68,11 +68,7 @@ def train(
     if resume is None:
         try_out(config)
         return run(Training(config), out)
-    training = Training.load(resume)
-    if config not in (Config(), training.config):
-        raise ValueError(f"--resume goes on with the run in {resume} as it was "
-                         "configured: leave the other options out.")
-    return run(training, out)
+    return run(Training.load(resume), out)
 
 
 def try_out(config):
@@ -229,6 +225,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run one command. argv: the words after `python -m dnddpg_minimal` → exit code."""
     argv = sys.argv[1:] if argv is None else list(argv)
     try:
+        check_resume(argv)
         if argv and argv[0] in elsewhere():
             module = importlib.import_module(f"dnddpg_minimal.{argv[0]}")
             return module.main(argv[1:])
@@ -258,6 +255,15 @@ def elsewhere():
     """The commands whose module exists, and what they do."""
     return {name: text for name, text in ELSEWHERE.items()
             if importlib.util.find_spec(f"dnddpg_minimal.{name}")}
+
+
+def check_resume(argv):
+    """ValueError for an option of the run in `argv`, beside --resume."""
+    options = {word.partition("=")[0] for word in argv if word.startswith("--")}
+    others = options - {"--resume", "--out", "--help"}
+    if "--resume" in options and others:
+        raise ValueError("--resume goes on with a run as it was configured: leave "
+                         f"{', '.join(sorted(others))} out.")
 
 
 def task_options_registry():

@@ -162,15 +162,18 @@ def film(task, algorithm="DN-DDPG", variant="class", seed=0, folder=None):
 
 
 def film_all(folder=None):
-    """Film the recorded agents that the book shows; says which could not be. → 0.
+    """Film the recorded agents that the book shows; says which could not be.
 
-    `folder` holds recordings, by default those of the package.
+    `folder` holds recordings, by default those of the package. Returns the exit code: 1
+    if nothing could be filmed.
     """
+    filmed = 0
     for name in FILMED:
         task, variant, file = name.split("/")
         algorithm, seed = file.rsplit("-", 1)
         try:
             print(*film(task, algorithm, variant, int(seed), folder))
+            filmed += 1
         except ValueError as error:
-            print(f"no film: {error}")
-    return 0
+            print(f"no film: {error}", file=sys.stderr)
+    return 0 if filmed else 1

@@ -13,7 +13,6 @@ A record is one small file: recordings/<task>/<variant>/<algorithm>-<seed>.npz.
 | `write_readme(folder)` | the same, put into recordings/README.md |
 """
 
-import glob
 import json
 import warnings
 from collections import Counter
@@ -83,19 +82,21 @@ def load_study(task=None, algorithm=None, variant="class", what="evaluations",
         raise ValueError(f"what={what!r}: expected one of {', '.join(WHAT)}.")
     if rule not in (None, *CHOICES["act_rule"]):
         raise ValueError(_not_allowed("rule", rule, CHOICES["act_rule"]))
-    found = []
-    names = [glob.escape(name) if name else "*" for name in (task, variant, algorithm)]
-    for path in Path(folder or RECORDINGS).glob("{}/{}/{}-*.npz".format(*names)):
-        if algorithm not in (None, path.stem.rpartition("-")[0]):
-            continue  # "DN" is not "DN-DDPG"
+    asked = dict(task=task, variant=variant, algorithm=algorithm)
+    folder, found = Path(folder or RECORDINGS), []
+    for name in _names(folder):
+        path, known = folder / name, _named(name)
+        if not all(known[field] and value in (None, known[field])
+                   for field, value in asked.items()):
+            continue
         try:
-            found += _read(path, what, rule)
+            found += _read(path, name, what, rule)
         except Exception as error:  # zipfile and NumPy raise a dozen kinds
             warnings.warn(f"{path} is skipped: it is damaged, or no record of this "
                           f"study ({type(error).__name__}: {error}). Delete it, and "
                           "`study` makes it again.", stacklevel=2)
     if not found:
-        _refuse_unknown(folder, task=task, variant=variant, algorithm=algorithm)
+        _refuse_unknown(folder, asked)
     found.sort(key=lambda one: _order(*(one[name] for name in RUN)))
     return _frame(found) if what in TABLES else found
 
@@ -103,18 +104,29 @@ def load_study(task=None, algorithm=None, variant="class", what="evaluations",
 RUN = ("task", "algorithm", "variant", "seed")
 
 
-def _refuse_unknown(folder, **asked):
+def _names(folder):
+    """Where the records in a folder lie. A task's own name may hold one slash."""
+    return [path.relative_to(folder).as_posix() for pattern in
+            ("*/*/*-*.npz", "*/*/*/*-*.npz") for path in folder.glob(pattern)]
+
+
+def _named(name):
+    """task/variant/algorithm-seed as a dict."""
+    task, variant, file = name.rsplit("/", 2)
+    return dict(task=task, variant=variant, algorithm=file.rpartition("-")[0])
+
+
+def _refuse_unknown(folder, asked):
     """ValueError if a name that was asked for is neither planned nor recorded."""
     from dnddpg_minimal.study import list_of
 
     names = [run.name for budget in ("class", "paper") for run in list_of(budget)]
-    names += [path.relative_to(folder or RECORDINGS).as_posix()
-              for path in Path(folder or RECORDINGS).glob("*/*/*-*.npz")]
-    parts = zip(*(name.rpartition("-")[0].split("/") for name in names), strict=True)
-    for (field, value), known in zip(asked.items(), parts, strict=True):
+    names += _names(folder)
+    for field, value in asked.items():
+        known = {_named(name)[field] for name in names}
         if value is not None and value not in known:
             raise ValueError(f"Nothing is planned or recorded with {field}={value!r}."
-                             f"{_nearest(value, sorted(set(known)))}")
+                             f"{_nearest(value, sorted(known))}")
 
 
 def _order(task, algorithm, variant, seed):
@@ -123,8 +135,8 @@ def _order(task, algorithm, variant, seed):
             algorithms.index(algorithm), algorithm, seed)
 
 
-def _read(path, what, rule):
-    """What one record holds of `what`: a list of one dict, or of none."""
+def _read(path, name, what, rule):
+    """What the record at `path`, whose name is that, holds of `what`: [dict] or []."""
     with open(path, "rb") as file, np.load(file, allow_pickle=False) as content:
         meta = json.loads(str(content["meta"]))
         if meta["format"] != FORMAT:
@@ -132,9 +144,9 @@ def _read(path, what, rule):
         config = meta["config"]
         one = dict(task=config["task"], algorithm=config["algorithm"],
                    variant=meta["variant"], seed=config["seed"])
-        name = "{task}/{variant}/{algorithm}-{seed}.npz".format(**one)
-        if path.parts[-3:] != Path(name).parts:
-            raise ValueError(f"it is a copy of {name}")  # and would count twice
+        own = "{task}/{variant}/{algorithm}-{seed}.npz".format(**one)
+        if name != own:
+            raise ValueError(f"it is a copy of {own}")  # and would count twice
         if what in TABLES:
             names, labels = meta[f"{what}_numbers"], meta[f"{what}_labels"]
             if not names:
@@ -264,11 +276,14 @@ def results(variant="class", folder=None, until=np.inf):
     Each run counts by its `score`. The bias is the first critic's, at the policy's
     action: over start states, on MuJoCo over on-policy states. Two DataFrames, the
     runs' and their summary over (task, variant, algorithm); "steps" is a run's length,
-    "return", "bias" and "owed" hold (mean, error, n).
+    "return", "bias" and "owed" hold (mean, error, n). ValueError if none is recorded.
     """
     import pandas as pd
 
     table = load_study(variant=variant, folder=folder)
+    if table.empty:
+        raise ValueError(f"No run of variant {variant!r} is recorded in "
+                         f"{folder or 'the package'}.")
     table = table[table.step <= until]
     rows = load_study(variant=variant, what="bias", folder=folder)
     rows = rows[(rows.action == "policy") & (rows.critic == "0") & (rows.step <= until)]

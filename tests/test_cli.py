@@ -138,8 +138,10 @@ def test_a_file_that_exists_is_not_overwritten(capsys, trained):
 
 def test_resuming_takes_no_other_choices(capsys, trained):
     file, _ = trained
-    said = fails_in_one_line(capsys, "train", "--resume", file, "--gamma", 0.5)
-    assert "leave the other options out" in said
+    # Also what equals a default: the run in the file may have another seed
+    for words, name in ((["--gamma", 0.5], "--gamma"), (["--seed=0"], "--seed")):
+        said = fails_in_one_line(capsys, "train", "--resume", file, *words)
+        assert f"leave {name} out" in said
 
 
 # --- train ----------------------------------------------------------------------------

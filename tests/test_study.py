@@ -719,6 +719,32 @@ def test_a_name_that_nobody_planned_is_refused_and_a_planned_one_is_empty(tmp_pa
     study.record(study.Run(tiny(steps=300).config, "mine"), tmp_path, tmp_path / "s")
     assert len(study.load_study(variant="mine", folder=tmp_path))
     assert study.load_study("Hopper-v5", variant="mine", folder=tmp_path).empty
+    with pytest.raises(ValueError, match="No run of variant 'paper' is recorded"):
+        records.results("paper", tmp_path)
+
+
+def test_records_of_a_task_in_a_namespace_are_found_and_copies_are_not(tmp_path):
+    import gymnasium
+
+    task = "mine/Pendulum-v0"
+    gymnasium.register(task, "gymnasium.envs.classic_control:PendulumEnv",
+                       max_episode_steps=200)
+    try:
+        run = tiny(steps=300, task=task)
+        study.record(run, tmp_path, tmp_path / "s")
+        table = study.load_study(task, variant=run.variant, folder=tmp_path)
+        assert set(table.task) == {task} and len(table)
+        shutil.copytree(tmp_path / "mine" / "Pendulum-v0", tmp_path / "old")
+        with pytest.warns(UserWarning, match=f"it is a copy of {task}"):
+            both = study.load_study(variant=None, folder=tmp_path)
+        assert len(both) == len(table)
+    finally:
+        del gymnasium.registry[task]
+
+
+def test_films_say_what_is_missing_and_fail_if_all_is(tmp_path, capsys):
+    assert study.main(["--films", "--folder", str(tmp_path)]) == 1
+    assert capsys.readouterr().err.count("no film: ") == len(records.FILMED)
 
 
 def test_a_claim_needs_an_interval_on_one_side_of_zero():
