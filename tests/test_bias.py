@@ -808,3 +808,58 @@ def test_a_flag_after_the_time_limit_is_in_the_truth_and_no_success(limit, in_ti
                                along_the_velocity, gamma=0.99)
     assert found["truth"][0] > 20
     assert found["ended"].tolist() == [in_time]
+
+
+@pytest.mark.parametrize("limit, success", [(50, False), (51, True), (300, True)])
+def test_success_is_more_than_50_steps_on_the_goal_and_then_the_return_is_complete(
+    limit, success
+):
+    """The finger rests inside the goal, off its centre: the same reward each step."""
+    config = Config("ArmEasy-v0", max_episode_steps=limit)
+    world = instrument.dynamics(config)
+    joints = np.array([[0.3, 0.4]])
+    centre = arm.locate(joints)[:, 1] + arm.BASE  # of a goal around the finger
+    state = np.concatenate([joints, centre + [[4.0, 3.0]], [[0.0]]], axis=1)
+    found = instrument.rollout(world, state, lambda obs: np.zeros((len(obs), 2)), 0.95)
+    assert found["success"].tolist() == [success]
+    assert found["returns"][0] == pytest.approx(-min(limit, 51) * 5 / 400)
+    env = make_env(config)
+    env.reset(seed=0)
+    env.unwrapped.state = state[0]
+    steps, total, over = 0, 0.0, False
+    while not over:
+        _, reward, terminated, truncated, info = env.step(np.zeros(2, np.float32))
+        steps, total, over = steps + 1, total + reward, terminated or truncated
+    assert steps == min(limit, 51) and info["success"] == success
+    assert found["returns"][0] == pytest.approx(total, rel=1e-6)
+
+
+def test_recent_is_the_last_60_of_the_states_that_a_training_kept():
+    agent = make_agent(Config("Pendulum-v1", "DDPG"), 3, 1)
+    world = instrument.dynamics(agent.config)
+    states = world.reset(np.random.default_rng(6), 64)
+    kept = [{"state": state, "obs": obs, "action": np.zeros(1)}
+            for state, obs in zip(states, world.observe(states), strict=True)]
+
+    def recent(kept):
+        found = instrument.evaluate(fake_training(agent, kept)).bias
+        return [row for row in found if row["states"] == "recent"]
+
+    assert {row["n"] for row in recent(kept)} == {60}
+    assert recent(kept) == recent(kept[-60:]) != recent(kept[:60])
+
+
+def test_regret_counts_the_goals_that_can_be_reached():
+    config = Config("ArmHard-v0", "DDPG", task_options={"goal_area": "window"})
+    agent = make_agent(config, 9, 2)
+    starts = instrument.dynamics(config).reset(stream(0, "evaluation", 1000), 100)
+    assert np.isinf(arm.reference_steps(starts)).any()
+    assert np.isfinite(instrument.evaluate(fake_training(agent)).evaluation["regret"])
+
+
+def test_grown_counts_updates_of_the_slow_copies():
+    often = Config("Pendulum-v1", tau=0.05)
+    seldom = Config("Pendulum-v1", tau=0.05, target_every=10)
+    delta = [1.0, -2.0, 0.5]
+    expected = instrument.grown([10, 20, 60], delta, often)
+    assert np.array_equal(instrument.grown([100, 200, 600], delta, seldom), expected)
