@@ -212,7 +212,9 @@ def plot_verdicts(table, tasks, ax=None, title=""):
             text = row[task].replace("not distinguishable", "open").replace(
                 "does not hold", "does not").replace("not tested at this budget",
                 "too short").replace("not tested (", "").rstrip(")")
-            ax.text(x, y, text, ha="center", va="center", fontsize=7.5, color=colour)
+            text = text.replace(" alone", "\nalone")
+            ax.text(x, y, text, ha="center", va="center", fontsize=7.5, color=colour,
+                    linespacing=0.95)
     ax.set_xticks(range(len(tasks)), [short(task) for task in tasks], fontsize=7.5)
     ax.set_yticks(range(len(table)), list(table), fontsize=8)
     ax.tick_params(length=0, labeltop=True, labelbottom=False)
