@@ -293,6 +293,27 @@ def test_a_chapter_calls_the_others_by_their_names(notebook):
             assert " ".join(words.split()) == title_of(path)
 
 
+def test_whoever_is_cited_stands_among_the_sources_at_the_end_of_the_book():
+    """A name with a year, as in "Silver et al. 2014", is one line of chapter 12."""
+    text, sources = {}, []
+    for path in BOOK:
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        parts = ["".join(cell["source"]) for cell in cells
+                 if cell["cell_type"] == "markdown"]
+        if "## Sources" in parts[-1]:
+            sources = parts.pop().splitlines()
+        text[path.name] = "\n".join(parts)
+    for path in (ROOT / "dnddpg_minimal").rglob("*.py"):
+        text[path.name] = path.read_text(encoding="utf-8")
+    cited = [(place, *found) for place, words in text.items() for found in re.findall(
+        r"([A-Z][a-zé]+)(?:'s)?(?:\s+[a-zA-Z.,]+){0,5}?\s*[ (,]\s*((?:19|20)\d\d)\b",
+        words)]
+    assert len(cited) > 30
+    missing = [one for one in cited
+               if not any(one[1] in line and one[2] in line for line in sources)]
+    assert not missing
+
+
 def test_the_algorithm_is_as_short_as_the_reading_guides_say():
     """README and chapter 00: sections 3 to 6, up to PyTorch's agent: 270 lines."""
     text = (ROOT / "dnddpg_minimal" / "dnddpg.py").read_text(encoding="utf-8")
