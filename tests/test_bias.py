@@ -164,6 +164,14 @@ def test_the_truth_goes_on_beyond_the_time_limit():
     assert found["truth"][0] - endless == pytest.approx(found["tail"], rel=1e-6)
 
 
+def test_a_small_discount_cuts_the_truth_and_not_the_return():
+    world = instrument.dynamics(Config("Pendulum-v1"))
+    hang = np.array([[np.pi, 0.0]])
+    found = instrument.rollout(world, hang, lambda obs: np.zeros((len(obs), 1)), 0.5)
+    assert found["returns"][0] == pytest.approx(-(np.pi**2) * 200, rel=1e-6)
+    assert found["truth"][0] == pytest.approx(-(np.pi**2) * 2, rel=1e-6)
+
+
 def test_a_terminal_state_has_value_zero():
     world = instrument.dynamics(Config("MountainCarContinuous-v0"))
     before_the_goal = np.array([[0.449, 0.05], [-0.5, 0.0]])
@@ -442,6 +450,35 @@ def test_on_any_other_task_only_the_on_policy_truth_is_known():
     assert found.tail == pytest.approx(100 * 0.99**500)
     assert recent["states"] == "recent" and recent["q"] == 103.0
     assert np.isnan(recent["truth"]) and np.isnan(recent["bias"])
+
+
+class Late(Clock):
+    """Pays only from its 21st step on: no episode of 20 steps ever sees it."""
+
+    def reset(self, *, seed=None, options=None):
+        self.t = 0
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        self.t += 1
+        return np.zeros(1, np.float32), float(self.t > 20), False, False, {}
+
+
+def test_only_states_before_the_time_limit_count_and_what_follows_is_their_truth():
+    gym.register("LateForBias-v0", entry_point=Late, max_episode_steps=20)
+    try:
+        config = Config("LateForBias-v0", "DDPG")
+        q = lambda obs, action: np.zeros((1, len(obs)))  # noqa: E731
+        agent = FakeAgent(config, lambda obs: np.zeros((len(obs), 1)), q)
+        found = instrument.evaluate(fake_training(agent))
+    finally:
+        gym.registry.pop("LateForBias-v0")
+    assert found.evaluation["mean"] == 0.0
+    # From state t, 20 - t unpaid steps, then 1 for ever: 0.99^(20 - t) / 0.01
+    truth = np.mean([0.99 ** (20 - t) / 0.01 for t in range(20)])
+    assert found.bias[0]["truth"] == pytest.approx(truth, abs=found.tail)
+    beyond = np.mean([0.99 ** max(20 - t, 0) / 0.01 for t in range(500)])
+    assert abs(beyond - truth) > 2 * found.tail  # were later states counted, too
 
 
 @pytest.mark.parametrize("task", PROBE_TASKS[:4])
