@@ -1,7 +1,9 @@
 """A rule, an agent, a task of one's own: what a reader adds, the file unchanged."""
 
+import contextlib
 import re
 import textwrap
+import types
 import warnings
 from pathlib import Path
 
@@ -176,12 +178,51 @@ def test_the_closed_forms_refuse_what_they_do_not_know():
     assert np.isclose(bias.accumulated(0.1, 1.0, ends=0.5), 0.1)
 
 
+GUIDE = Path(__file__).parents[1] / "CONTRIBUTING.md"
+RULE, THEIRS = map(textwrap.dedent, re.findall(
+    r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL))
+
+
 def test_the_rule_in_contributing_runs(capsys):
-    guide = Path(__file__).parents[1] / "CONTRIBUTING.md"
-    (block,) = re.findall(r"```python\n(.*?)```", guide.read_text(encoding="utf-8"),
-                          re.DOTALL)
-    exec(textwrap.dedent(block), {})
+    exec(RULE, {})
     assert abs(float(capsys.readouterr().out.split()[-1])) < 1e-5
+
+
+def test_somebody_elses_critics_in_contributing_are_measured():
+    pytest.importorskip("stable_baselines3", reason="needs the extra dev")
+    exec(THEIRS.replace("10_000", "200"), names := {})
+    rows = [row for row in names["found"].bias if row["states"] == "start"]
+    assert [row["critic"] for row in rows] == ["0", "1", "min"]
+    assert all(row["n"] == 100 and abs(row["bias"]) > 1 for row in rows)
+
+
+@pytest.mark.parametrize("task", ["Pendulum-v1", "Hopper-v5"])
+def test_an_agent_that_answers_three_calls_is_measured(task):
+    """What CONTRIBUTING asks of somebody else's agent, and no more."""
+    config = Config(task, critics=2, actors=1)
+    with contextlib.closing(make_env(config)) as env:
+        (obs_dim,), (width,) = env.observation_space.shape, env.action_space.shape
+
+    class Theirs:
+        def __init__(self):
+            self.config, self.obs_dim = config, obs_dim
+
+        def act(self, obs):
+            return np.zeros((len(obs), width)) if np.ndim(obs) == 2 else np.zeros(width)
+
+        def actions(self, obs, slow=False):
+            return self.act(obs)[None]
+
+        def q_values(self, obs, action):
+            return np.array([[5.0], [7.0]]).repeat(len(obs), axis=1)
+
+    found = bias.evaluate(types.SimpleNamespace(
+        config=config, agent=Theirs(), step=10, updates=10, kept=[]))
+    at = "start" if task == "Pendulum-v1" else "on_policy"
+    rows = {row["critic"]: row for row in found.bias if row["states"] == at}
+    assert {name: row["q"] for name, row in rows.items()} == {"0": 5, "1": 7, "min": 5}
+    for row in rows.values():
+        assert np.isclose(row["bias"], row["q"] - row["truth"])
 
 
 class InPlace(gym.Env):
