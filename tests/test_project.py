@@ -293,25 +293,46 @@ def test_a_chapter_calls_the_others_by_their_names(notebook):
             assert " ".join(words.split()) == title_of(path)
 
 
+def words_of(notebook):
+    """The text cells of a chapter, each on one line; without the book's last pages."""
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    text = [" ".join("".join(cell["source"]).split()) for cell in cells
+            if cell["cell_type"] == "markdown"]
+    return [cell for cell in text if not cell.startswith(("## Sources", "## Index"))]
+
+
+def last_page(title):
+    """The text of one of the book's last pages, at the end of its last chapter."""
+    cells = json.loads(BOOK[-1].read_text(encoding="utf-8"))["cells"]
+    (page,) = ["".join(cell["source"]) for cell in cells
+               if "".join(cell["source"]).startswith(f"## {title}")]
+    return page
+
+
 def test_whoever_is_cited_stands_among_the_sources_at_the_end_of_the_book():
-    """A name with a year, as in "Silver et al. 2014", is one line of chapter 12."""
-    text, sources = {}, []
-    for path in BOOK:
-        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-        parts = ["".join(cell["source"]) for cell in cells
-                 if cell["cell_type"] == "markdown"]
-        if "## Sources" in parts[-1]:
-            sources = parts.pop().splitlines()
-        text[path.name] = "\n".join(parts)
-    for path in (ROOT / "dnddpg_minimal").rglob("*.py"):
-        text[path.name] = path.read_text(encoding="utf-8")
+    """A name with a year, as in "Silver et al. 2014", is one line there."""
+    text = {path.name: "\n".join(words_of(path)) for path in BOOK} | {
+        path.name: path.read_text(encoding="utf-8")
+        for path in (ROOT / "dnddpg_minimal").rglob("*.py")}
     cited = [(place, *found) for place, words in text.items() for found in re.findall(
         r"([A-Z][a-zé]+)(?:'s)?(?:\s+[a-zA-Z.,]+){0,5}?\s*[ (,]\s*((?:19|20)\d\d)\b",
         words)]
+    cited = [one for one in cited if one[1] != "After"]  # "After 2000 updates"
     assert len(cited) > 30
+    sources = last_page("Sources").splitlines()
     missing = [one for one in cited
                if not any(one[1] in line and one[2] in line for line in sources)]
     assert not missing
+
+
+def test_a_word_in_the_index_stands_in_the_chapters_that_it_names():
+    entries = " ".join(last_page("Index").split("\n\n")[-1].split()).split(" · ")
+    text = {path.name[:2]: " ".join(words_of(path)).lower() for path in BOOK}
+    assert len(entries) > 40 and entries == sorted(entries, key=str.lower)
+    for entry in entries:
+        word, chapters = re.fullmatch(r"(.+?) (\d\d(?:, \d\d)*)", entry).groups()
+        for chapter in chapters.split(", "):
+            assert re.search(rf"\b{re.escape(word.lower())}", text[chapter]), entry
 
 
 def test_the_algorithm_is_as_short_as_the_reading_guides_say():
