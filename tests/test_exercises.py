@@ -230,8 +230,11 @@ def assert_fails(kernel, wrong, cells):
             except AssertionError as error:
                 said = str(error)
     assert said is not None, f"this passes:\n{code}"
-    digits = r"[-−+]?\d[\d.]*(e[-+]\d+)?"
+    digits = r"[-−+]?\d[\d.]*(?:e[-+]\d+)?"
     assert re.sub(digits, "#", said) == re.sub(digits, "#", printed)
+    numbers = [[float(number.replace("−", "-").rstrip("."))
+                for number in re.findall(digits, text)] for text in (said, printed)]
+    np.testing.assert_allclose(*numbers, rtol=0.02, atol=1e-3)
 
 
 @each_solution
