@@ -309,7 +309,7 @@ def test_every_verdict_has_a_field_and_a_claim_about_no_task_has_none():
              "three": {"Pendulum-v1": f"{st.HOLDS} alone", "Hopper-v5": st.UNTESTED}}
     ax = plots.plot_verdicts(table, ["Pendulum-v1", "Hopper-v5"])
     assert [text.get_text() for text in ax.texts] == [
-        "holds", "does not", "open", "n = 1", "holds alone", "too short"]
+        "holds", "does not", "open", "n = 1", "holds\nalone", "too short"]
     assert len({patch.get_facecolor() for patch in ax.patches}) == 5
 
 
