@@ -17,6 +17,7 @@ a few lines around SciPy, and needs no training.
 | `share_of_the_paper`, `settled`, `tested` | is the budget enough for a claim? |
 | `verdict(differences, ...)` | holds, does not hold, not distinguishable, not tested |
 | `all_of(verdicts)` | the verdict on a claim of several parts |
+| `deciding_p(whole, parts)` | the p-value that it rests on |
 """
 
 import numpy as np
@@ -422,3 +423,15 @@ def all_of(verdicts):
     if missing:
         return min(missing, key=lambda one: ("n =" not in one, one))  # the fewest
     return OPEN if OPEN in verdicts else HOLDS
+
+
+def deciding_p(whole, parts):
+    """The p-value on which the verdict on a claim of several parts rests: a float.
+
+    whole: the claim's verdict, by `all_of`. parts: (verdict, p-value) of each of its
+    differences. One part is enough to refuse: then it is the smallest p of the parts
+    that do. To hold, a claim needs all of them: then it is the largest.
+    """
+    if whole == FAILS:
+        return min(p for found, p in parts if found == FAILS)
+    return max(p for _, p in parts)

@@ -349,3 +349,10 @@ def test_holm_is_wrong_about_one_of_many_in_one_study_of_twenty_at_most():
     p = rng.uniform(size=(4_000, 10))  # no difference is real
     wrong = np.mean([(st.holm(one) < 0.05).any() for one in p])
     assert 0.035 < wrong < 0.065 < np.mean((p < 0.05).any(axis=1))
+
+
+def test_a_claim_rests_on_its_weakest_part_and_its_refusal_on_the_surest():
+    holds, fails, open_ = st.HOLDS, st.FAILS, st.OPEN
+    assert st.deciding_p(holds, [(holds, 0.01), (holds, 0.2)]) == 0.2
+    assert st.deciding_p(fails, [(fails, 0.03), (fails, 0.2), (holds, 0.001)]) == 0.03
+    assert st.deciding_p(open_, [(open_, 0.6), (holds, 0.01)]) == 0.6
