@@ -92,9 +92,12 @@ def load_study(task=None, algorithm=None, variant="class", what="evaluations",
         try:
             found += _read(path, name, what, rule)
         except Exception as error:  # zipfile and NumPy raise a dozen kinds
-            warnings.warn(f"{path} is skipped: it is damaged, or no record of this "
-                          f"study ({type(error).__name__}: {error}). Delete it, and "
-                          "`study` makes it again.", stacklevel=2)
+            why = ("it is damaged, or no record of this study", "Delete it, and "
+                   "`study` makes it again.")
+            if isinstance(error, PermissionError):
+                why = "you may not read it", "See its owner and its rights."
+            warnings.warn(f"{path} is skipped: {why[0]} ({type(error).__name__}: "
+                          f"{error}). {why[1]}", stacklevel=2)
     if not found:
         _refuse_unknown(folder, asked)
     found.sort(key=lambda one: _order(*(one[name] for name in RUN)))
@@ -187,13 +190,16 @@ def _read(path, name, what, rule):
 def share_of_ends(episodes, steps, config, bug=None):
     """The share of the transitions in memory that were stored as the world's end: (M,).
 
-    Of all transitions so far: the memory holds them all until it is full.
     episodes (E, 3): step, length, return of each; steps (M,) ask; config: a dict of
     its fields. An episode that is shorter than its time limit has ended, on the Arms
-    only with `success_terminates`; `ends` and `bug` may store something else.
+    only with `success_terminates`; `ends` and `bug` may store something else. For a
+    task that is not registered here the limit is the longest episode.
     """
-    limit = (config["max_episode_steps"]
-             or gymnasium.spec(config["task"]).max_episode_steps or np.inf)
+    limit = config["max_episode_steps"]
+    try:
+        limit = limit or gymnasium.spec(config["task"]).max_episode_steps or np.inf
+    except gymnasium.error.Error:
+        limit = episodes[:, 1].max(initial=0)
     ended = episodes[:, 1] < limit
     if config["task"].startswith("Arm"):
         ended &= (config["task_options"] or {}).get("success_terminates", False)
@@ -201,8 +207,11 @@ def share_of_ends(episodes, steps, config, bug=None):
         ended[:] = False
     elif config["ends"] == "any_end" or bug == "time_limit":
         ended[:] = True
-    count = np.searchsorted(episodes[ended, 0], steps, side="right")
-    return count / np.maximum(steps, 1)
+    steps = np.asarray(steps)
+    first = np.maximum(steps - config["buffer_size"], 0)  # older ones are gone
+    stored, gone = (np.searchsorted(episodes[ended, 0], until, side="right")
+                    for until in (steps, first))
+    return (stored - gone) / np.maximum(steps - first, 1)
 
 
 def owed(columns, config, ends):
@@ -386,7 +395,6 @@ def write_readme(folder=None):
 
     ValueError if the folder has no record, or its README.md not both marks in order.
     """
-    from dnddpg_minimal.statistics import OPEN
     from dnddpg_minimal.study import list_of
 
     path = Path(folder or RECORDINGS) / "README.md"
@@ -401,11 +409,12 @@ def write_readme(folder=None):
                          "into the tables.")
     runs, table = results(None, folder)
     plan = Counter(run.name.rpartition("-")[0] for run in list_of("class"))
-    text = [f"{len(runs)} of {plan.total()} runs. Each number: mean ± standard error "
-            "over the runs. A run counts by the mean of its last ten evaluations, on "
-            "MuJoCo five. What has fewer steps than `class` stands beside `class` cut "
-            "at these steps. *runs*: how many there are, of how many the plan names; "
-            "where some are missing, the row is interim.\n"]
+    known = runs.reset_index()[["task", "variant", "algorithm"]].agg("/".join, axis=1)
+    text = [f"{known.isin(plan).sum()} of {plan.total()} planned runs. Each number: "
+            "mean ± standard error over the runs. A run counts by the mean of its last "
+            "ten evaluations, on MuJoCo five. What has fewer steps than `class` stands "
+            "beside `class` cut at these steps. *runs*: how many there are, of how "
+            "many the plan names; where some are missing, the row is interim.\n"]
     row = "| {} |".format
     heads = ["task", "variant", "steps", "algorithm", "runs", "return", "bias of Q",
              "owed to lag"]
@@ -423,14 +432,27 @@ def write_readme(folder=None):
         cells = ["{:.4g} ± {:.2g}".format(*value) if value[2] > 1 else
                  "{:.4g}".format(*value) for value in values[:3]]
         planned = plan[f"{task}/{variant.partition(', ')[0]}/{algorithm}"]
-        count = f"{values['return'][2]} of {planned}"
+        count = f"{values['return'][2]} of {planned}" if planned else "not planned"
         text.append(row(" | ".join([task, variant, f"{values.steps:.0f}", algorithm,
                                     count, *cells])))
+    of_class = runs[runs.index.get_level_values("variant") == "class"]
+    if len(of_class):
+        text += _claims_and_predictions(of_class, folder)
+    part = Path(f"{path}.part")
+    part.write_text(before + begin + "\n".join(text) + "\n" + end + after,
+                    encoding="utf-8", newline="\n")
+    part.replace(path)
+
+
+def _claims_and_predictions(runs, folder):
+    """The second and the third table of `write_readme`, as lines of text."""
+    from dnddpg_minimal.statistics import OPEN
+
+    row = "| {} |".format
     heads = ["claim", "task", "difference", "owed to lag", "verdict",
              "after Holm's correction", "verdict beyond lag"]
-    text += ["", row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
-    of_class = runs.xs("class", level="variant", drop_level=False)
-    found = claims(of_class)
+    text = ["", row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
+    found = claims(runs)
     for one in found:
         owed = f"{one['owed']:.3g}" if np.isfinite(one["owed"]) else "–"
         text.append("| {claim} | {task} | {mean:.3g} ± {error:.2g} ({n}) | {} | "
@@ -443,12 +465,13 @@ def write_readme(folder=None):
     heads = ["difference in bias", "task", "grown from δ as measured",
              "grown from σ, κ, ρ", "measured, states from memory",
              "measured, start states"]
-    text += ["", row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
-    for one in predictions(of_class, folder):
-        text.append("| {pair} | {task} | {delta:.3g} | {closed:.3g} | {recent:.3g} ± "
-                    "{recent_error:.2g} ({n}) | {start:.3g} ± {start_error:.2g} ({n}) |"
-                    .format(**one))
-    part = Path(f"{path}.part")
-    part.write_text(before + begin + "\n".join(text) + "\n" + end + after,
-                    encoding="utf-8", newline="\n")
-    part.replace(path)
+    text += ["", "In brackets behind a prediction: does the mean measured at states "
+             "from memory lie within four standard errors of it?", "",
+             row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
+    for one in predictions(runs, folder):
+        near = ["yes" if abs(one[name] - one["recent"]) <= 4 * one["recent_error"] else
+                "no" for name in ("delta", "closed")]
+        text.append("| {pair} | {task} | {delta:.3g} ({}) | {closed:.3g} ({}) | "
+                    "{recent:.3g} ± {recent_error:.2g} ({n}) | {start:.3g} ± "
+                    "{start_error:.2g} ({n}) |".format(*near, **one))
+    return text

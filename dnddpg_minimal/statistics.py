@@ -347,13 +347,21 @@ HOLDS, FAILS = "holds", "does not hold"
 OPEN, UNTESTED = "not distinguishable", "not tested at this budget"
 
 
+def _finite(differences):
+    differences = np.asarray(differences, np.float64)
+    if not np.isfinite(differences).all():
+        raise ValueError(f"differences={differences}: expected finite numbers. Leave "
+                         "out the pairs of which a run is missing.")
+    return differences
+
+
 def p_value(differences):
     """Chance of a mean so far from 0, were the true one 0: t test, two-sided.
 
     differences (n,). Below 0.05 where the 95 % t interval leaves 0 out. NaN for fewer
-    than three.
+    than three. ValueError if one is not finite.
     """
-    differences = np.asarray(differences, np.float64)
+    differences = _finite(differences)
     if len(differences) < FEWEST:
         return np.nan
     if np.ptp(differences) == 0:  # all equal: sure, or nothing at all
@@ -389,15 +397,15 @@ def verdict(differences, claim="greater", margin=0.0, tested=True,
 
     differences (n,). claim: "greater" than `margin`, "less" than −`margin`, or "same":
     within ± `margin`. confidence: that of the interval. ValueError for another claim, a
-    negative margin, and for "same" without a margin, which no measurement could ever
-    confirm.
+    negative margin, a difference that is not finite, and for "same" without a margin,
+    which no measurement could ever confirm.
     """
     if claim not in ("greater", "less", "same"):
         raise ValueError(f"claim={claim!r}: expected greater, less or same.")
     if margin < 0 or (claim == "same" and margin == 0):
         raise ValueError(f"margin={margin!r}: expected 0 or more, and more than 0 for "
                          "the claim 'same'.")
-    differences = np.asarray(differences, np.float64)
+    differences = _finite(differences)
     if len(differences) < FEWEST:
         return f"not tested (n = {len(differences)})"
     if not tested:

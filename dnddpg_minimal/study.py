@@ -23,6 +23,7 @@ recordings/README.md says how to use it on one machine and on several.
 import errno
 import gc
 import hashlib
+import heapq
 import itertools
 import json
 import os
@@ -49,7 +50,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from dnddpg_minimal import bias
 from dnddpg_minimal.dnddpg import (
@@ -78,7 +79,7 @@ from dnddpg_minimal.records import (
 
 __all__ = ["Run", "list_of", "load_agent_at", "load_study", "record", "score", "study"]
 
-CHECKPOINT_EVERY = 75  # seconds, then at the next episode's end
+CHECKPOINT_EVERY = 50  # seconds, then at the next episode's end: within two minutes
 PROBE_STEP = 2_000  # a test repeats a run so far, and compares the weights
 PICTURES_AT = (0.1, 0.25, 0.5, 1.0)  # of the steps: planes and weights
 DEATHS = 3  # a run whose process died so often is given up
@@ -326,7 +327,8 @@ def pictures(run, agent, step):
     config, arrays = run.config, {}
     if run.variant == "class" and config.task in SMALL:
         if step in {round(part * config.steps) for part in PICTURES_AT}:
-            plane = bias.plane(agent, bias.dynamics(config))
+            with threadpool_limits(1):  # one run, one thread
+                plane = bias.plane(agent, bias.dynamics(config))
             arrays = {name: plane[name] for name in ("x", "y", "q", "truth")}
             if config.seed < 3:
                 arrays["theta"] = agent.arrays()["theta"]
@@ -389,11 +391,13 @@ def owed_to(rows, config, episodes, bug=None):
 def visits(task, replay):
     """How many states of the replay memory lie in each cell: (BINS y, BINS x).
 
-    task: one of PLANES, which says what a cell is.
+    task: one of PLANES, which says what a cell is. What lies outside counts in the cell
+    at the border: in float32 MountainCar's wall at -1.2 is a little beyond it.
     """
     project, (range_x, range_y) = PLANES[task]
     x, y = project(replay.arrays.obs[:replay.size].astype(np.float64))
-    counts, _, _ = np.histogram2d(y, x, bins=BINS, range=(range_y, range_x))
+    counts, _, _ = np.histogram2d(np.clip(y, *range_y), np.clip(x, *range_x),
+                                  bins=BINS, range=(range_y, range_x))
     return counts.astype(np.uint32)
 
 
@@ -656,12 +660,13 @@ def _work(run, folder, scratch, every):
 
 
 def study(runs, folder=RECORDINGS, scratch=None, workers=2, nice=10, scheduler=None,
-          every=CHECKPOINT_EVERY, report=lambda done, running: None):
+          every=CHECKPOINT_EVERY, report=lambda ended, running: None):
     """Do the runs whose record is missing. → {name: why} of those that failed.
 
     `workers` processes do one run each at a time; with `scheduler`, an address, a Dask
-    cluster does them. `report(done, running)` is called about once a second, with the
-    names of the runs that ended just now and the `Checkpoint`s of those that go on. A
+    cluster does them. `report(ended, running)` is called about once a second: `ended`
+    is a dict from the names of the runs that ended just now to "done", or to why they
+    failed; `running` are the `Checkpoint`s of those that go on. A
     run whose process dies is done again, at most three times. folder, scratch, every:
     as in `record`; nice: how much the workers stand back for other processes.
 
@@ -685,7 +690,7 @@ def study(runs, folder=RECORDINGS, scratch=None, workers=2, nice=10, scheduler=N
                         future = slot.submit(_work, run, str(folder), scratch, every)
                         futures[future] = run, slot
                         slot.running += 1
-                done = []
+                ended = {}
                 for future in wait(futures, 1, FIRST_COMPLETED).done:
                     run, slot = futures.pop(future)
                     slot.running -= 1
@@ -693,7 +698,8 @@ def study(runs, folder=RECORDINGS, scratch=None, workers=2, nice=10, scheduler=N
                     if what == "died":
                         slot.renew()
                         deaths[run.name] += 1
-                        what = f"its process died {DEATHS} times"
+                        what = (f"its process died {DEATHS} times (a crash, a kill, or "
+                                "too little memory)")
                         if deaths[run.name] < DEATHS:
                             waiting.appendleft(run)
                             continue
@@ -702,9 +708,9 @@ def study(runs, folder=RECORDINGS, scratch=None, workers=2, nice=10, scheduler=N
                         continue
                     if what != "done":
                         failed[run.name] = what
-                    done.append(run.name)
+                    ended[run.name] = what
                 going_on = [run for run, _ in futures.values()]
-                report(done, [Checkpoint(run, folder, scratch) for run in going_on])
+                report(ended, [Checkpoint(run, folder, scratch) for run in going_on])
         finally:
             for slot in slots:
                 slot.ask_to_stop()
@@ -815,7 +821,7 @@ def command(
     except KeyboardInterrupt:
         print("Stopped. Nothing recorded is lost: the same command goes on.")
         return 130
-    for name, why in failed.items():
+    for name, why in failed.items():  # once more, where it is seen
         print(f"failed: {name}: {why}", file=sys.stderr)
     print(f"{len(missing) - len(failed)} runs done, {len(failed)} failed.")
     return 1 if failed else 0
@@ -840,7 +846,8 @@ class Progress:
         from tqdm import tqdm
 
         self.size = {run.name: rough_work(run.config) for run in runs}
-        self.over, self.began = set(), time.monotonic()
+        self.over, self.seen, self.began = set(), set(), time.monotonic()
+        self.held = 0.0  # work that lay in checkpoints: it took no time now
         form = "{percentage:5.1f} % |{bar}| {remaining} left  {desc}"
         self.bar = tqdm(total=sum(self.size.values()), disable=None, bar_format=form)
 
@@ -850,17 +857,24 @@ class Progress:
     def __exit__(self, *_):
         self.bar.close()
 
-    def __call__(self, done, running):
-        self.over.update(done)
+    def __call__(self, ended, running):
+        self.over.update(ended)
         part = {one.run.name: one.progress() for one in running}
+        self.held += sum(self.size[name] * share for name, share in part.items()
+                         if name not in self.seen)
+        self.seen.update(part)
+        self.bar.initial = self.held
         self.bar.n = sum(size * part.get(name, name in self.over)
                          for name, size in self.size.items())
         self.bar.set_description_str("  ".join(
             f"{name} {100 * share:.0f} %" for name, share in part.items() if share))
-        for name in done if self.bar.disable else ():
+        for name in ended if self.bar.disable else ():
             minutes = (time.monotonic() - self.began) / 60
             print(f"{minutes:8.1f} min  {len(self.over)} of {len(self.size)}  {name}",
                   flush=True)
+        for name, what in ended.items():
+            if what != "done":  # now: a study may last for days
+                self.bar.write(f"failed: {name}: {what}", file=sys.stderr)
 
 
 def rough_work(config):
@@ -876,15 +890,18 @@ def tell(runs, missing, folder, scratch, timed, workers):
 
     folder, scratch: as in `record`. timed: also the hours, with so many workers.
     """
-    groups, total = {}, 0.0
+    groups, seconds = {}, {}  # seconds: of what is left of each run
     for run in runs:
         groups.setdefault((run.config.task, run.variant), []).append(run)
     for (task, variant), group in groups.items():
         todo = [run for run in group if run in missing]
         line = f"{task:26}{variant:34}{len(group) - len(todo):4} of {len(group):3}"
         if timed:
-            hours = sum(seconds_of(run.config) for run in todo) / 3600
-            line, total = f"{line}{hours:9.2f} core-hours to do", total + hours
+            for run in todo:
+                left = 1 - Checkpoint(run, folder, scratch).progress()
+                seconds[run.name] = left * seconds_of(run)
+            hours = sum(seconds[run.name] for run in todo) / 3600
+            line = f"{line}{hours:9.2f} core-hours to do"
         print(line, flush=True)
         for algorithm in dict.fromkeys(run.config.algorithm for run in todo):
             seeds = [run.config.seed for run in todo
@@ -895,28 +912,45 @@ def tell(runs, missing, folder, scratch, timed, workers):
         if part > 0:
             print(f"unfinished: {run.name} {100 * part:.0f} %")
     if timed:
-        print(f"{total:.1f} core-hours, {total / workers:.1f} hours with {workers} "
-              "workers, if each has a core of its own.")
+        total, longest = sum(seconds.values()), time_needed(
+            [seconds[run.name] for run in missing], workers)
+        print(f"{total / 3600:.1f} core-hours, {longest / 3600:.1f} hours with "
+              f"{workers} workers, if each has a core of its own. Less where episodes "
+              "end early (Hopper, Walker2d, Humanoid).")
     return 0
 
 
-def seconds_of(config):
-    """Seconds that a config's run will take here, from a short one of the same sizes.
+def time_needed(seconds, workers):
+    """Seconds until all is done: each worker takes the next run when it is free.
+
+    seconds: of each run, in order. One run is never shared.
+    """
+    free = [0.0] * workers  # when each worker is free
+    for one in seconds:
+        heapq.heapreplace(free, free[0] + one)
+    return max(free)
+
+
+def seconds_of(run):
+    """Seconds that a run will take here, from a short one of the same sizes.
 
     An upper bound where episodes end early (Hopper, Walker2d, Humanoid).
     """
+    config = run.config
     steps, limit = config.steps, config.max_episode_steps or 1_000
     if steps is None:
         steps = config.episodes * limit
-    learning, measuring, in_full = probe(
+    learning, measuring, in_full, plane = probe(
         config.task, config.algorithm, config.hidden, config.batch_size,
         config.updates_per_step)
-    return steps * learning + steps / config.evaluate_every * measuring + in_full
+    drawn = len(PICTURES_AT) if run.variant == "class" else 0
+    return (steps * learning + steps / config.evaluate_every * measuring + in_full
+            + drawn * plane)
 
 
 @cache
 def probe(task, algorithm, hidden, batch_size, updates_per_step):
-    """Seconds of one step with its updates, of one evaluation, of all the full ones.
+    """Seconds: a step with its updates, an evaluation, all the full ones, a plane.
 
     Measured on a short run with these fields of `Config`.
     """
@@ -928,7 +962,13 @@ def probe(task, algorithm, hidden, batch_size, updates_per_step):
     walking, learning = ((clock[step + 100] - clock[step]) / 100 for step in (50, 200))
     if task in MUJOCO_TASKS:  # as if every episode lasted to its time limit
         acting = walking + 5e-5  # and the policy's own time
-        return learning, 5 * 1_000 * acting, 4 * 64 * 2 * 500 * acting
+        return learning, 5 * 1_000 * acting, 4 * 64 * 2 * 500 * acting, 0.0
+    training.kept = (training.kept * bias.RECENT)[:bias.RECENT]  # as many as later
     begun = time.process_time()
-    bias.evaluate(training)
-    return learning, time.process_time() - begun, 0.0  # here each one is full
+    bias.evaluate(training)  # here each one is full
+    measured, plane = time.process_time(), 0.0
+    if task in SMALL:
+        with threadpool_limits(1):
+            bias.plane(training.agent, bias.dynamics(config))
+        plane = time.process_time() - measured
+    return learning, measured - begun, 0.0, plane

@@ -356,3 +356,9 @@ def test_a_claim_rests_on_its_weakest_part_and_its_refusal_on_the_surest():
     assert st.deciding_p(holds, [(holds, 0.01), (holds, 0.2)]) == 0.2
     assert st.deciding_p(fails, [(fails, 0.03), (fails, 0.2), (holds, 0.001)]) == 0.03
     assert st.deciding_p(open_, [(open_, 0.6), (holds, 0.01)]) == 0.6
+
+
+def test_a_missing_run_is_refused_not_passed_over():
+    for judge in (st.verdict, st.p_value):
+        with pytest.raises(ValueError, match="expected finite numbers"):
+            judge([5, 5.1, np.nan, 5.2, 4.9])
