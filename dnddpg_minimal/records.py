@@ -70,7 +70,8 @@ def load_study(task=None, algorithm=None, variant="class", what="evaluations",
         episodes  step, length, episode_return                         (E,)
         planes    step (T,), x (N,), y (N,), q (T, C, N, N), truth (T, N, N)
         weights   step (T,), theta (T, P); for `load_agent_at`
-        visits    counts (N, N), x (N + 1,) and y (N + 1,), the cells' edges
+        visits    counts (N, N) of the states in memory at the run's end (`class`: of
+                  all), x (N + 1,) and y (N + 1,), the cells' edges
         meta      config, versions, processor, seconds, ..., first_losses (20, C)
 
     T times of the run, N points of an axis; pictures have the axes [y, x]. A damaged
