@@ -29,6 +29,7 @@ from dnddpg_minimal.dnddpg import Config, NumpyAgent, Training, make_env
 from dnddpg_minimal.films import (
     FILM_LENGTH,
     check_display,
+    check_window,
     make_camera_env,
     play,
     window_closed,
@@ -179,6 +180,7 @@ def watch(
     if film is None:
         check_display()
         with closing(make_env(agent.config, render_mode="human")) as env:
+            check_window(env)
             for start in starts:
                 show(agent, env, start)
         return 0

@@ -48,6 +48,7 @@ from threadpoolctl import threadpool_limits
 
 from . import arm
 from .dnddpg import (
+    _TURN,
     PROBE_TASKS,
     choose_actor,
     is_mujoco,
@@ -181,7 +182,8 @@ class Arm(Dynamics):
         return states, reward, success & self.task.success_terminates
 
     def on_goal(self, states):
-        return states[:, 4]
+        # An episode may begin on the goal, and its counter still at 0
+        return np.maximum(states[:, 4], arm._on_goal(arm._gap(states)))
 
 
 class Probe(Dynamics):
@@ -505,7 +507,7 @@ def evaluate(training, full=None):
     world = dynamics(config)
     if full is None:
         full = world is not None or _reaches_a_quarter(config, training.step)
-    with threadpool_limits(1):  # one run, one thread
+    with _TURN, threadpool_limits(1):  # one run, one thread
         if world is None:
             return _by_episodes(agent, common, rng, training.kept, full)
         return _by_equations(agent, common, rng, training.kept, full, world)

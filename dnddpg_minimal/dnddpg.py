@@ -38,6 +38,7 @@ import json
 import math
 import os
 import re
+import threading
 import warnings
 from copy import copy
 from dataclasses import asdict, dataclass
@@ -78,8 +79,9 @@ CHOICES = dict(
 _ABOVE_0 = math.ulp(0.0)  # the smallest number above 0
 LIMITS = {  # (lowest, highest): fields. Whole numbers where the lowest is an int
     (0, math.inf): "seed warmup updates_per_step freeze_actors_after",
-    (1, math.inf): "critics actors steps episodes max_episode_steps batch_size "
-                   "target_every buffer_size evaluate_every yield_every",
+    (1, math.inf): "critics actors steps episodes max_episode_steps target_every "
+                   "evaluate_every yield_every",
+    (1, 10**9): "batch_size buffer_size",
     (0.0, 1.0): "gamma theta nu",
     (0.0, 1e9): "sigma",
     (-1e9, 1e9): "y_min",
@@ -119,29 +121,31 @@ class Config:
     `algorithm` sets `critics` and `actors`; they may be given instead (then the name
     is derived, else "C3-K2"). Nothing given means DN-DDPG. Numbers that contradict a
     given name are refused with a ValueError, as is every other value out of range.
+    (`dataclasses.replace` keeps what the preset gave: for another task or algorithm
+    make a new Config.)
     """
 
     task: str = "Pendulum-v1"  # name of a Gymnasium task
     algorithm: str | None = None  # DDPG, DCN-DDPG or DN-DDPG
     seed: int = 0  # 0, 1, 2, ...; the source of every random number of the run
-    critics: int | None = None  # C, number of critics
-    actors: int | None = None  # K, number of actors, K <= C; actor k climbs critic k
-    steps: int | None = None  # environment steps of the whole run
-    episodes: int | None = None  # end after so many episodes instead (then no steps)
-    max_episode_steps: int | None = None  # time limit; None: the task's own
+    critics: int | None = None  # C, number of critics, 1 or more
+    actors: int | None = None  # K, number of actors, 1 to C; actor k climbs critic k
+    steps: int | None = None  # environment steps of the whole run, 1 or more
+    episodes: int | None = None  # 1 or more: end after so many instead (no steps then)
+    max_episode_steps: int | None = None  # time limit, 1 or more; None: the task's
     task_options: dict[str, Any] | None = None  # passed to the environment
-    hidden: tuple[int, ...] | None = None  # widths of the hidden layers
+    hidden: tuple[int, ...] | None = None  # widths of the hidden layers, 1 or more
     batch_size: int | None = None  # B, transitions in one update, 1 or more
     gamma: float | None = None  # γ, discount of one step, 0 to 1
     tau: float | None = None  # τ of Eq. (1), 0 < τ <= 1; 1 copies outright
     target_every: int = 1  # updates between two moves of the slow copies, 1 or more
     critic_lr: float = 1e-3  # α, learning rate of the critics (Adam), 0 < α <= 1
     actor_lr: float = 1e-3  # α, learning rate of the actors (Adam), 0 < α <= 1
-    warmup: int | None = None  # first steps: uniform actions, no update
-    buffer_size: int | None = None  # transitions in replay; None: min(steps, 100 000)
-    updates_per_step: int = 1  # updates after each step
+    warmup: int | None = None  # first steps, 0 or more: uniform actions, no update
+    buffer_size: int | None = None  # transitions in replay; None: 100 000, or steps
+    updates_per_step: int = 1  # updates after each step, 0 or more
     noise: str | None = None  # exploration: gaussian, or ou (Ornstein-Uhlenbeck)
-    sigma: float | None = None  # σ of the noise, 0 or more, in half action ranges
+    sigma: float | None = None  # σ of the noise, 0 to 1e9, in half action ranges
     theta: float = 0.15  # θ of the OU noise, pull towards 0 in one step, 0 to 1
     noise_decay: float = 1.0  # factor of the noise after each episode, 0 < it <= 1
     target_rule: str = "max_min"  # max_min, single, paired_min, selected or soft
@@ -149,11 +153,11 @@ class Config:
     climbs: str = "own"  # actor k climbs critic k (own), or all climb the first
     init: str = "independent"  # independent, tied_actors or tied_critics
     ends: str = "terminated"  # what cuts a bootstrap: terminated, none or any_end
-    y_min: float | None = None  # lower limit of y, in units of return; None: no limit
+    y_min: float | None = None  # lower limit of y, ±1e9, in units of return
     nu: float = 0.1  # ν of target_rule soft: weight of the min over actors, 0 to 1
-    freeze_actors_after: int | None = None  # after this step only the critics learn
-    evaluate_every: int | None = None  # steps between two records of kind "grid"
-    yield_every: int = 250  # steps between two records of kind "progress"
+    freeze_actors_after: int | None = None  # a step: after it only the critics learn
+    evaluate_every: int | None = None  # steps, 1 or more, from "grid" record to record
+    yield_every: int = 250  # steps, 1 or more, from "progress" record to record
     backend: str = "numpy"  # numpy (gradients by hand) or torch (autograd)
     device: str = "cpu"  # cpu or cuda (backend torch only)
     dtype: str = "float32"  # float32, or float64 for comparing the two agents
@@ -174,7 +178,9 @@ class Config:
         for name, allowed in CHOICES.items():
             if mine[name] not in allowed:
                 raise ValueError(_not_allowed(name, mine[name], allowed))
+            mine[name] = allowed[allowed.index(mine[name])]  # plain text, for to_json
         self._check_the_rest()
+        mine["device"] = str(self.device)
         mine["hidden"] = tuple(int(width) for width in self.hidden)
 
     def _networks(self):
@@ -188,7 +194,8 @@ class Config:
         elif str(self.algorithm) in ALGORITHMS:
             critics, actors = ALGORITHMS[str(self.algorithm)]
         else:
-            raise ValueError(_not_allowed("algorithm", self.algorithm, ALGORITHMS))
+            known = *ALGORITHMS, "C3-K2"  # the form of all others
+            raise ValueError(_not_allowed("algorithm", self.algorithm, known))
         if self.critics not in (None, critics) or self.actors not in (None, actors):
             raise ValueError(f"critics={self.critics}, actors={self.actors} contradict "
                              f"algorithm={self.algorithm!r}, which has {critics} and "
@@ -231,8 +238,11 @@ class Config:
 
         The small tasks take the `class` numbers with those episodes and limits, since
         Table 1 speaks of MuJoCo only. Rows 1 and 10 have no clear meaning: left out.
-        task, algorithm and seed are the fields of Config.
+        task, algorithm and seed are the fields of Config. ValueError for a task that
+        has no preset: the paper doesn't speak of it.
         """
+        if task not in PRESETS:
+            raise ValueError(_not_allowed("task", task, PRESETS))
         table_1 = dict(actor_lr=1e-4, critic_lr=1e-4, hidden=(400, 300), batch_size=256,
                        tau=0.01, gamma=0.99, target_every=10, episodes=5_000)
         small = dict(episodes=2_000, max_episode_steps=300)
@@ -483,6 +493,28 @@ def adam(theta, dtheta, m, v, t, lr, beta1=0.9, beta2=0.999, eps=1e-8):
 # --- 5. Targets and choices -----------------------------------------------------------
 
 
+def choose_actor(q, rule="paired"):
+    """Which actor acts: Eq. (12). q (C, K, B) → index of an actor, (B,), by `rule`:
+
+        paired   argmax over k of critic k at actor k's action   Eq. (12) as printed
+        max_min  argmax over k of the min over all critics
+        first    always the first actor
+
+    Raises ValueError for another rule, and if `paired` finds more actors than critics.
+    """
+    actors = range(q.shape[1])
+    if rule == "paired":
+        if len(actors) > len(q):
+            raise ValueError("'paired' needs a critic for each actor; got q "
+                             f"{q.shape}, axes (C, K, B).")
+        return q[actors, actors].argmax(axis=0)  # over actors
+    if rule == "max_min":
+        return q.min(axis=0).argmax(axis=0)
+    if rule == "first":
+        return np.zeros(q.shape[2], int)
+    raise ValueError(_not_allowed("act_rule", rule, CHOICES["act_rule"]))
+
+
 def next_value(q_next, rule="max_min", nu=0.1):
     """The value of the next states, (B,), that the target takes from q_next (C, K, B).
 
@@ -541,28 +573,6 @@ def td_target(reward, terminated, q_next, gamma, rule="max_min", nu=0.1, y_min=N
         raise ValueError(f"y is not finite: {y[~np.isfinite(y)][0]!r}. The rewards are "
                          "broken, or the critics have diverged (lower critic_lr?).")
     return y
-
-
-def choose_actor(q, rule="paired"):
-    """Which actor acts: Eq. (12). q (C, K, B) → index of an actor, (B,), by `rule`:
-
-        paired   argmax over k of critic k at actor k's action   Eq. (12) as printed
-        max_min  argmax over k of the min over all critics
-        first    always the first actor
-
-    Raises ValueError for another rule, and if `paired` finds more actors than critics.
-    """
-    actors = range(q.shape[1])
-    if rule == "paired":
-        if len(actors) > len(q):
-            raise ValueError("'paired' needs a critic for each actor; got q "
-                             f"{q.shape}, axes (C, K, B).")
-        return q[actors, actors].argmax(axis=0)  # over actors
-    if rule == "max_min":
-        return q.min(axis=0).argmax(axis=0)
-    if rule == "first":
-        return np.zeros(q.shape[2], int)
-    raise ValueError(_not_allowed("act_rule", rule, CHOICES["act_rule"]))
 
 
 # --- 6. Agents ------------------------------------------------------------------------
@@ -629,6 +639,13 @@ class Agent:
         self.critic_target, self.actor_target = self.cut(self.theta_target)
         self._prepare()
 
+    def __getstate__(self):  # for copy and pickle: the layers must be views again
+        return self.config, self.obs_dim, self.action_dim, self.arrays()
+
+    def __setstate__(self, state):
+        self.__init__(*state[:-1])
+        self.set_arrays(state[-1])
+
     def act(self, obs):
         """The greedy action at obs, without noise: (O,) → (A,) or (B, O) → (B, A)."""
         batch = self._rows(obs, self.obs_dim, "obs")
@@ -688,10 +705,14 @@ class Agent:
         """One update: critics, then actors (if `climb`), then slow copies.
 
         Returns the losses, "critic" (C,) and "actor" (K,): NaN without a climb. Raises
-        ValueError for a batch that is not finite, before anything has changed.
+        ValueError for a batch that is not finite, or whose parts are not equally long,
+        before anything has changed.
         """
         config = self.config
         batch = Batch(*(np.asarray(part, self.dtype) for part in batch))
+        if len({part.shape[:1] for part in batch}) > 1:
+            raise ValueError("batch: expected parts of one length B; got the shapes "
+                             f"{', '.join(str(part.shape) for part in batch)}.")
         self._rows(batch.obs, self.obs_dim, "obs")
         self._rows(batch.action, self.action_dim, "action")
         y = self.td_target(batch)  # (B,)
@@ -723,8 +744,9 @@ class Agent:
             agent = cls(config, int(content["obs_dim"]), int(content["action_dim"]))
             agent.set_arrays(content)
         except (KeyError, TypeError, ValueError) as error:
+            lacks = "it lacks " if isinstance(error, KeyError) else ""
             raise ValueError(f"{path} holds no agent that this version can read: "
-                             f"{error}.") from error
+                             f"{lacks}{error}.") from error
         return agent
 
 
@@ -896,7 +918,9 @@ def make_env(config, render_mode=None):
                        disable_env_checker=True, **shown, **config.task_options)
     except (gym.error.Error, ImportError, TypeError) as error:
         why = f"can't be made with task_options={config.task_options}: {error}"
-        if config.task.split(":")[-1] not in gym.registry:
+        if ":" in config.task:
+            why = "names a module: import it first, and give the name behind the colon."
+        elif config.task.split(":")[-1] not in gym.registry:
             why = f"is unknown to Gymnasium.{_nearest(config.task, gym.registry)}"
         raise ValueError(f"{named} {why}") from error
     for name in ("observation_space", "action_space"):
@@ -907,7 +931,9 @@ def make_env(config, render_mode=None):
     if not np.issubdtype(env.action_space.dtype, np.floating):
         raise ValueError(f"{named} has actions of {env.action_space.dtype}: expected "
                          "floating point numbers.")
-    if not env.action_space.is_bounded():
+    with np.errstate(over="ignore"):
+        width = env.action_space.high - env.action_space.low
+    if not np.isfinite(width).all():
         raise ValueError(f"{named} has unbounded actions {env.action_space}: expected "
                          "finite bounds, since actors end in tanh.")
     return env
@@ -963,7 +989,8 @@ class Record(NamedTuple):
 KEPT = 64  # simulator states kept for the measurement of bias,
 KEEP_EVERY = 156  # one from so many steps: 64 from the last 10 000
 FIRST_LOSSES = 20  # critic losses kept from the start of the run
-LARGEST = 1e38  # more than this does not fit into float32
+LARGEST = 1e18  # the square of more does not fit into float32
+_TURN = threading.RLock()  # limits of threads are the process's: one at a time
 
 
 class Training:
@@ -997,7 +1024,7 @@ class Training:
         self.records, self.kept, self.first_losses = [], [], []
         self._threads = ThreadpoolController()
         self._remember()
-        self._loop = self._run()
+        self._loop, self._ended = self._run(), False
 
     @property
     def updates(self):
@@ -1014,9 +1041,9 @@ class Training:
         return self
 
     def __next__(self) -> Record:
-        with self._threads.limit(limits=1):  # one run, one thread
+        with _TURN, self._threads.limit(limits=1):  # one run, one thread
             record = next(self._loop, None)
-        if record is None and not self.finished:
+        if record is None and not self._ended:
             raise RuntimeError(f"This run broke off at step {self.step}: save(path), "
                                "then Training.load(path) goes on.")
         if record is None:
@@ -1045,6 +1072,7 @@ class Training:
             self.noise.scale *= config.noise_decay
             self._remember()
             yield record
+        self._ended = True
 
     def _step(self, obs):
         """One step of the environment, then the updates. → next obs, over."""
@@ -1057,7 +1085,8 @@ class Training:
             to_env(action, self.env.action_space))
         next_obs = self._checked(next_obs, reward)
         over = bool(terminated or truncated)
-        end = {"terminated": terminated, "none": False, "any_end": over}[config.ends]
+        end = {"terminated": bool(terminated), "none": False,
+               "any_end": over}[config.ends]
         self._store(obs, action, reward, next_obs, end)
         self._return += float(reward)
         self._length += 1
@@ -1068,10 +1097,13 @@ class Training:
 
     def _checked(self, obs, reward=0.0):
         """A copy of obs, since a task may hand out its own state and change it."""
-        if not (abs(reward) < LARGEST and (np.abs(obs) < LARGEST).all()):  # nor is NaN
+        shapes, kind = (np.shape(obs), np.shape(reward)), np.asarray(reward).dtype.kind
+        if not (shapes == ((self.agent.obs_dim,), ()) and kind in "fiub"
+                and abs(reward) < LARGEST and (np.abs(obs) < LARGEST).all()):  # no NaN
             raise ValueError(f"step {self.step} of {self.config.task!r}: reward "
-                             f"{reward!r}, observation {obs!r}: expected finite "
-                             f"numbers below {LARGEST:g}.")
+                             f"{reward!r}, observation {obs!r}: expected one finite "
+                             f"number, and {self.agent.obs_dim} of them on one axis, "
+                             f"all below {LARGEST:g}.")
         return np.array(obs)
 
     def _explore(self, obs):
@@ -1152,8 +1184,9 @@ class Training:
             training = cls(Config.from_json(str(content["config"])))
             training._restore(content)
         except (KeyError, TypeError, ValueError) as error:
+            lacks = "it lacks " if isinstance(error, KeyError) else ""  # as an agent's
             raise ValueError(f"{path} holds no training that this version can resume: "
-                             f"{error}.") from error
+                             f"{lacks}{error}.") from error
         return training
 
     def _restore(self, content):

@@ -12,6 +12,7 @@
 import math
 import os
 import sys
+import warnings
 from itertools import islice
 from pathlib import Path
 
@@ -110,6 +111,25 @@ def check_display():
     """ValueError if no window can be opened here."""
     if not has_display():
         raise ValueError("there is no display to open a window on: "
+                         "write a film instead, with --film FILE.gif")
+
+
+def check_window(env):
+    """ValueError if env's window would open nowhere: DISPLAY may name a dead screen."""
+    if is_mujoco(env):
+        import glfw
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the sentence below says it
+            opened = glfw.init()
+    else:
+        import pygame
+
+        pygame.display.init()
+        nowhere = {"offscreen", "dummy"} - {os.environ.get("SDL_VIDEODRIVER")}
+        opened = pygame.display.get_driver() not in nowhere
+    if not opened:
+        raise ValueError(f"no window opens on DISPLAY={os.environ.get('DISPLAY')}: "
                          "write a film instead, with --film FILE.gif")
 
 

@@ -886,6 +886,16 @@ def test_recent_is_the_last_60_of_the_states_that_a_training_kept():
     assert recent(kept) == recent(kept[-60:]) != recent(kept[:60])
 
 
+def test_who_starts_on_the_goal_needs_no_step():
+    world = instrument.dynamics(Config("ArmEasy-v0"))
+    states = world.reset(stream(0, "evaluation", 7), 2_000)
+    there = arm.reference_steps(states) == 0
+    assert 0 < there.sum() < 100
+    stay = instrument.rollout(world, states, lambda obs: np.zeros((len(obs), 2)), 0.95)
+    assert (stay["steps_to_goal"][there] == 0).all()
+    assert (stay["steps_to_goal"][~there] > 0).all()
+
+
 def test_regret_counts_the_goals_that_can_be_reached():
     config = Config("ArmHard-v0", "DDPG", task_options={"goal_area": "window"})
     agent = make_agent(config, 9, 2)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dnddpg_minimal import Config, NumpyAgent, Training
+from dnddpg_minimal import Config, NumpyAgent, Training, make_agent
 from dnddpg_minimal.__main__ import command, main
 
 pytestmark = pytest.mark.slow
@@ -94,7 +94,8 @@ def test_help_needs_neither_torch_nor_a_simulator():
     (["--task-options", "g=abc"], "does not begin with task_options={'g': 'abc'}"),
     (["--task", "Hopper-v5", "--task-options", "frame_skip=0"], "ZeroDivisionError"),
     (["--task", "Hopper-v5", "--task-options", "reset_noise_scale=abc"], "'abc'"),
-    (["--buffer-size", "1000000000000"], "not enough memory"),
+    (["--buffer-size", "1000000000000"], "at most 1e+09"),
+    (["--task", "Humanoid-v5", "--buffer-size", "1000000000"], "not enough memory"),
     (["--out", "no-such-folder/a.npz"], "no-such-folder"),
     (["--resume", "no-such-file.npz"], "no-such-file.npz: No such file"),
 ])
@@ -272,6 +273,22 @@ def test_without_a_display_watch_asks_for_a_film(trained, capsys, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert "--film" in fails_in_one_line(capsys, "watch", trained[0])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a screen is DISPLAY only there")
+@pytest.mark.parametrize("task", ["Pendulum-v1", "Hopper-v5"])
+def test_with_a_dead_display_watch_asks_for_a_film(task, tmp_path):
+    path = tmp_path / "agent.npz"
+    make_agent(Config(task), *{"Pendulum-v1": (3, 1), "Hopper-v5": (11, 3)}[task]
+               ).save(path)
+    strange = {"SDL_VIDEODRIVER", "MUJOCO_GL", "WAYLAND_DISPLAY"}
+    env = {k: v for k, v in os.environ.items() if k not in strange}
+    said = subprocess.run(
+        [sys.executable, "-m", "dnddpg_minimal", "watch", str(path)],
+        env=env | {"DISPLAY": ":987"}, capture_output=True, text=True, timeout=60)
+    assert said.returncode == 2 and said.stdout == ""
+    assert said.stderr.splitlines()[-1].endswith("with --film FILE.gif")
+    assert "Traceback" not in said.stderr
 
 
 def test_closing_the_window_ends_watch(trained, capsys, monkeypatch):

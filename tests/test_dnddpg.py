@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import pickle
+from copy import deepcopy
 
 import gymnasium as gym
 import numpy as np
@@ -547,6 +549,8 @@ def test_without_a_time_limit_given_the_tasks_own_holds():
     ("CartPole-v1", {}, "action_space Discrete.*continuous"),
     ("FrozenLake-v1", {}, "Discrete"),
     (toys.TASK, toys.UNBOUNDED, "unbounded"),
+    (toys.TASK, {"low": [-3e38], "high": [3e38]}, "unbounded"),  # their width is inf
+    ("dnddpg_minimal:ArmEasy-v0", {}, "names a module: import it first"),
     (toys.TASK, {"obs_shape": (2, 2)}, "observation_space.*flat"),
     (toys.TASK, {"colour": "red"}, "task_options.*colour"),
     ("Pendulum-v1", {"gravity": 3}, "task_options.*gravity"),
@@ -890,6 +894,40 @@ def test_an_agents_file_holds_all_that_the_next_update_needs(kind, tmp_path):
     obs = random_batch(30).obs
     np.testing.assert_array_equal(again.actions(obs), agent.actions(obs))
     np.testing.assert_array_equal(again.q_next(obs), agent.q_next(obs))
+
+
+@AGENTS
+def test_a_copied_agent_learns_as_the_original_does(kind):
+    agent = tiny_agent(kind, algorithm="DN-DDPG")
+    agent.update(random_batch())
+    copies = [deepcopy(agent), pickle.loads(pickle.dumps(agent))]
+    for one in (agent, *copies):
+        for seed in range(1, 4):
+            one.update(random_batch(seed=seed))
+    obs = random_batch(30).obs
+    for one in copies:
+        assert one.updates == 4
+        np.testing.assert_array_equal(one.actions(obs), agent.actions(obs))
+        np.testing.assert_array_equal(one.q_next(obs), agent.q_next(obs))
+
+
+@AGENTS
+def test_a_batch_whose_parts_differ_in_length_is_refused(kind):
+    agent, batch = tiny_agent(kind), random_batch()
+    for part in Batch._fields:
+        odd = batch._replace(**{part: getattr(batch, part)[:1]})
+        with pytest.raises(ValueError, match="parts of one length"):
+            agent.update(odd)
+    assert agent.updates == 0
+
+
+def test_the_wrong_kind_of_file_is_told_what_it_lacks(tmp_path):
+    tiny_agent().save(tmp_path / "agent.npz")
+    with pytest.raises(ValueError, match="no training .* it lacks 'small'"):
+        Training.load(tmp_path / "agent.npz")
+    write_npz(tmp_path / "other.npz", x=np.eye(2))
+    with pytest.raises(ValueError, match="no agent .* it lacks 'config'"):
+        NumpyAgent.load(tmp_path / "other.npz")
 
 
 def test_a_trainings_file_opens_as_its_agent(tmp_path):

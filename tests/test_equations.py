@@ -4,6 +4,7 @@ A line of the table reads `(11) y = ...   td_target, choose_actor`: the equation
 number, what it says, and which functions it lies in. In the code the tag is `Eq. (11)`.
 """
 
+import ast
 import inspect
 import re
 from functools import reduce
@@ -59,11 +60,26 @@ def test_every_tag_in_the_code_is_in_the_table():
     assert in_code == in_table
 
 
-def test_both_agents_updates_follow_the_same_equations_in_the_same_order():
-    """Critics, then actors, then slow copies (the contract's order)."""
+def test_an_update_follows_the_equations_in_the_contracts_order():
+    """Critics, then actors, then slow copies; each agent has the two halves."""
+    tags = TAG.findall(inspect.getsource(dnddpg.Agent.update))
+    assert tags == ["3", "4", "1"]
     for agent in (dnddpg.NumpyAgent, dnddpg.TorchAgent):
-        tags = TAG.findall(inspect.getsource(agent.update))
-        assert tags == ["3", "4", "1"], agent
+        assert "update" not in vars(agent)  # one body, for both
+        assert TAG.findall(inspect.getsource(agent.fit_critics)) == ["3"]
+        assert TAG.findall(inspect.getsource(agent.climb_critics)) == ["4"]
+
+
+def test_the_file_reads_from_top_to_bottom():
+    """No function, and no class outside its methods, uses a name that comes later."""
+    tree = ast.parse(SOURCE)
+    line = {node.name: node.lineno for node in tree.body
+            if isinstance(node, (ast.FunctionDef, ast.ClassDef))}
+    later = {(name, user.id) for name, begin in line.items()
+             for node in tree.body if getattr(node, "name", None) == name
+             for user in ast.walk(node) if isinstance(user, ast.Name)
+             and line.get(user.id, begin) > begin}
+    assert not later
 
 
 def test_every_equation_that_is_code_is_named_by_a_test():

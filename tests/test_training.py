@@ -7,6 +7,7 @@ import random
 import re
 import subprocess
 import sys
+import threading
 import time
 from functools import cache
 
@@ -414,6 +415,35 @@ def test_an_observation_that_is_not_finite_stops_the_run_by_step_and_value(bad):
         toy_run(task_options=dict(bad_step=23, bad_obs=bad))
 
 
+@pytest.mark.parametrize("bad", [
+    dict(bad_reward=np.array([1.0])), dict(bad_reward=None), dict(bad_reward="1"),
+    dict(bad_reward=np.ones(2)), dict(bad_reward=1e30), dict(bad_obs=1e30)])
+def test_what_is_no_plain_number_is_refused_with_its_step(bad):
+    with pytest.raises(ValueError, match="step 23 of 'Toy-v0'.*expected one finite"):
+        run = Training(Config(toys.TASK, steps=40, **SMALL))
+        run.env.unwrapped.bad_step = 23
+        vars(run.env.unwrapped).update(bad)
+        list(run)
+
+
+@pytest.mark.parametrize("shape", [(1, 2), (1,), (), (3,)])
+def test_an_observation_of_another_shape_is_refused_not_broadcast(shape, monkeypatch):
+    real = toys.Toy.step
+    monkeypatch.setattr(toys.Toy, "step", lambda env, action: (
+        np.zeros(shape, np.float32), *real(env, action)[1:]))
+    with pytest.raises(ValueError, match="step 1 of 'Toy-v0'.*2 of them on one axis"):
+        toy_run(steps=5)
+
+
+def test_a_run_that_breaks_off_in_its_last_step_is_not_over():
+    training = Training(Config(toys.TASK, steps=40, **SMALL))
+    training.env.unwrapped.bad_step, training.env.unwrapped.bad_obs = 40, math.nan
+    with pytest.raises(ValueError, match="step 40"):
+        list(training)
+    with pytest.raises(RuntimeError, match="broke off at step 40"):
+        list(training)
+
+
 def test_a_first_observation_that_is_not_finite_stops_the_run():
     with pytest.raises(ValueError, match="step 0 of 'Toy-v0'.*nan"):
         toy_run(task_options=dict(bad_step=0, bad_obs=math.nan))
@@ -470,6 +500,26 @@ def test_one_thread_inside_and_the_callers_number_outside(monkeypatch):
                        if pool["user_api"] == "blas"}
             assert outside == {2}
     assert seen == [{1}] * 12
+
+
+def test_one_thread_also_where_two_trainings_run_in_two_threads():
+    def blas():
+        return {pool["num_threads"] for pool in threadpoolctl.threadpool_info()
+                if pool["user_api"] == "blas"}
+
+    seen = []
+    config = Config(toys.TASK, **SMALL, steps=300, warmup=5, yield_every=1)
+    runs = [Training(config) for _ in range(2)]
+    for run in runs:
+        run.env.unwrapped.on_step = lambda: seen.append(blas())
+    before = blas()
+    threads = [threading.Thread(target=list, args=(run,)) for run in runs]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert seen == [{1}] * 600
+    assert blas() == before
 
 
 # --- resume, bit for bit --------------------------------------------------------------
