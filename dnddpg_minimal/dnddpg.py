@@ -142,7 +142,7 @@ class Config:
     critic_lr: float = 1e-3  # α, learning rate of the critics (Adam), 0 < α <= 1
     actor_lr: float = 1e-3  # α, learning rate of the actors (Adam), 0 < α <= 1
     warmup: int | None = None  # first steps, 0 or more: uniform actions, no update
-    buffer_size: int | None = None  # transitions in replay; None: 100 000, or steps
+    buffer_size: int | None = None  # 1 to 1e9 transitions; None: min(steps, 100 000)
     updates_per_step: int = 1  # updates after each step, 0 or more
     noise: str | None = None  # exploration: gaussian, or ou (Ornstein-Uhlenbeck)
     sigma: float | None = None  # σ of the noise, 0 to 1e9, in half action ranges
@@ -442,7 +442,7 @@ def forward(layers, x):
         h = np.empty((*lead, x.shape[-2], layer.shape[-1] + 1), x.dtype)
         h[..., -1] = 1
         np.matmul(activations[-1], layer, out=h[..., :-1])
-        np.maximum(h, np.zeros(h.shape[-1], h.dtype), out=h)  # a row: 2× a 0's speed
+        np.maximum(h, np.zeros(h.shape[-1], h.dtype), out=h)  # faster than with 0
         activations.append(h)
     return [*activations, activations[-1] @ layers[-1]]
 
@@ -920,7 +920,7 @@ def make_env(config, render_mode=None):
         why = f"can't be made with task_options={config.task_options}: {error}"
         if ":" in config.task:
             why = "names a module: import it first, and give the name behind the colon."
-        elif config.task.split(":")[-1] not in gym.registry:
+        elif config.task not in gym.registry:
             why = f"is unknown to Gymnasium.{_nearest(config.task, gym.registry)}"
         raise ValueError(f"{named} {why}") from error
     for name in ("observation_space", "action_space"):
