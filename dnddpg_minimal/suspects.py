@@ -32,7 +32,7 @@ SUSPECTS = {
     "time_limit": (
         "stores the time limit as an end of the world",
         "one target in 200 would then be far from the others, Eq. (12.1): a loss "
-        "several times the right agent's, beside a return that is as good as ever. "
+        "several times the right agent's, beside a return that ends as it should. "
         "Look at both columns together"),
     "one_seed": (
         "starts every episode from the same state",
