@@ -618,7 +618,8 @@ def test_an_empty_folder_gives_an_empty_table(tmp_path):
     assert study.load_study(what="planes", folder=tmp_path) == []
 
 
-def test_350_records_load_in_two_seconds(tmp_path, undisturbed, runs):
+def test_350_records_load_in_little_more_than_the_reading_of_their_arrays(
+        tmp_path, undisturbed, runs):
     import pandas  # noqa: F401  its import is not ours to time
 
     with np.load(path_of(runs[1], undisturbed)) as file:
@@ -631,7 +632,13 @@ def test_350_records_load_in_two_seconds(tmp_path, undisturbed, runs):
     for what in records.TABLES:
         begun = time.process_time()
         table = study.load_study(variant="tiny", what=what, folder=tmp_path)
-        assert time.process_time() - begun < 2
+        loaded = time.process_time()
+        for path in tmp_path.glob("*/*/*.npz"):
+            with np.load(path) as file:
+                json.loads(str(file["meta"]))
+                assert len(file[what]) and file["episodes"].size
+        bare = time.process_time() - loaded
+        assert loaded - begun < 8 * bare  # 2 to 3 on an idle machine
         assert len(table) >= 350 * 2
 
 
