@@ -639,7 +639,7 @@ class Agent:
         self.critic_target, self.actor_target = self.cut(self.theta_target)
         self._prepare()
 
-    def __getstate__(self):  # for copy and pickle: the layers must be views again
+    def __getstate__(self):  # for copy and pickle: layers must be cut anew as views
         return self.config, self.obs_dim, self.action_dim, self.arrays()
 
     def __setstate__(self, state):
@@ -989,7 +989,7 @@ class Record(NamedTuple):
 KEPT = 64  # simulator states kept for the measurement of bias,
 KEEP_EVERY = 156  # one from so many steps: 64 from the last 10 000
 FIRST_LOSSES = 20  # critic losses kept from the start of the run
-LARGEST = 1e18  # the square of more does not fit into float32
+LARGEST = 1e18  # its square still fits into float32
 _TURN = threading.RLock()  # limits of threads are the process's: one at a time
 
 

@@ -125,9 +125,12 @@ def check_window(env):
     else:
         import pygame
 
-        pygame.display.init()
         nowhere = {"offscreen", "dummy"} - {os.environ.get("SDL_VIDEODRIVER")}
-        opened = pygame.display.get_driver() not in nowhere
+        try:
+            pygame.display.init()
+            opened = pygame.display.get_driver() not in nowhere
+        except pygame.error:
+            opened = False
     if not opened:
         raise ValueError(f"no window opens on DISPLAY={os.environ.get('DISPLAY')}: "
                          "write a film instead, with --film FILE.gif")

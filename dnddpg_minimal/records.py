@@ -410,8 +410,10 @@ def write_readme(folder=None):
                          "into the tables.")
     runs, table = results(None, folder)
     plan = Counter(run.name.rpartition("-")[0] for run in list_of("class"))
-    known = runs.reset_index()[["task", "variant", "algorithm"]].agg("/".join, axis=1)
-    text = [f"{known.isin(plan).sum()} of {plan.total()} planned runs. Each number: "
+    names = {run.name for run in list_of("class")}
+    known = names & {f"{task}/{variant}/{algorithm}-{seed}"
+                     for task, algorithm, variant, seed in runs.index}
+    text = [f"{len(known)} of {len(names)} planned runs. Each number: "
             "mean ± standard error over the runs. A run counts by the mean of its last "
             "ten evaluations, on MuJoCo five. What has fewer steps than `class` stands "
             "beside `class` cut at these steps. *runs*: how many there are, of how "
@@ -470,7 +472,8 @@ def _claims_and_predictions(runs, folder):
              "from memory lie within four standard errors of it?", "",
              row(" | ".join(heads)), row(" | ".join("---" for _ in heads))]
     for one in predictions(runs, folder):
-        near = ["yes" if abs(one[name] - one["recent"]) <= 4 * one["recent_error"] else
+        near = ["–" if one["n"] < 3 else
+                "yes" if abs(one[name] - one["recent"]) <= 4 * one["recent_error"] else
                 "no" for name in ("delta", "closed")]
         text.append("| {pair} | {task} | {delta:.3g} ({}) | {closed:.3g} ({}) | "
                     "{recent:.3g} ± {recent_error:.2g} ({n}) | {start:.3g} ± "

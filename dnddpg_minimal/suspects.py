@@ -32,8 +32,8 @@ SUSPECTS = {
     "time_limit": (
         "stores the time limit as an end of the world",
         "one target in 200 would then be far from the others, Eq. (12.1): a loss "
-        "several times the right agent's, beside a return that ends as it should. "
-        "Look at both columns together"),
+        "several times the right agent's, beside a return that mostly ends as it "
+        "should. Look at both columns together"),
     "one_seed": (
         "starts every episode from the same state",
         "all episodes of training would then begin alike, and their returns would "

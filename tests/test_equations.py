@@ -71,7 +71,7 @@ def test_an_update_follows_the_equations_in_the_contracts_order():
 
 
 def test_the_file_reads_from_top_to_bottom():
-    """No function, and no class outside its methods, uses a name that comes later."""
+    """No function and no class names another one that comes later in the file."""
     tree = ast.parse(SOURCE)
     line = {node.name: node.lineno for node in tree.body
             if isinstance(node, (ast.FunctionDef, ast.ClassDef))}

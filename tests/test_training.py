@@ -502,23 +502,30 @@ def test_one_thread_inside_and_the_callers_number_outside(monkeypatch):
     assert seen == [{1}] * 12
 
 
-def test_one_thread_also_where_two_trainings_run_in_two_threads():
+def test_two_trainings_in_two_threads_take_turns():
+    """Limits of threads are the process's: one would take back the other's."""
     def blas():
         return {pool["num_threads"] for pool in threadpoolctl.threadpool_info()
                 if pool["user_api"] == "blas"}
 
-    seen = []
-    config = Config(toys.TASK, **SMALL, steps=300, warmup=5, yield_every=1)
+    seen, inside, before = [], [], blas()
+
+    def step():
+        inside.append(1)
+        time.sleep(0.005)  # long enough for the other one to come in
+        seen.append((len(inside), blas()))
+        inside.pop()
+
+    config = Config(toys.TASK, **SMALL, steps=40, warmup=5, yield_every=1)
     runs = [Training(config) for _ in range(2)]
     for run in runs:
-        run.env.unwrapped.on_step = lambda: seen.append(blas())
-    before = blas()
+        run.env.unwrapped.on_step = step
     threads = [threading.Thread(target=list, args=(run,)) for run in runs]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert seen == [{1}] * 600
+    assert seen == [(1, {1})] * 80
     assert blas() == before
 
 
