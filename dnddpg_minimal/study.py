@@ -174,8 +174,8 @@ def _class():
     runs += _many(10, hard, ddpg, "hidden=184-184", hidden=(184, 184))
     runs += _many(5, hopper, ddpg, "hidden=184-184", hidden=(184, 184))
     runs += _many(5, walker, ddpg, "hidden=186-186", hidden=(186, 186))
-    runs += _many(10, (*pendulum, *hard), dcn, "updates_per_step=2", updates_per_step=2)
-    runs += _many(5, (*cheetah, *hopper), dcn, "updates_per_step=2", updates_per_step=2)
+    runs += _many(10, (*pendulum, *hard, *cheetah, *hopper), dcn, "updates_per_step=2",
+                  updates_per_step=2)
     runs += _many(10, pendulum, ALGORITHMS, "frozen", freeze_actors_after=20_000)
     runs += _many(1, (*cheetah, *hopper), ALGORITHMS, "frozen", **frozen)
     runs += _many(1, (*walker, *others), dn, "frozen", **frozen)
