@@ -1,8 +1,8 @@
 """The recorded study: which runs there are, doing them, resuming them.
 
-A run is a `Config`, a `variant` that names what is special about it, and perhaps one of
-the faulty trainings of bugs.py. Its record is one small file, written whole or not at
-all:
+A run is a `Config`, a `variant` that names what is special about it ("td3" is trained
+by td3.py), and perhaps one of the faulty trainings of bugs.py. Its record is one small
+file, written whole or not at all:
 
     recordings/<task>/<variant>/<algorithm>-<seed>.npz
 
@@ -103,6 +103,16 @@ class Run(NamedTuple):
         config = self.config
         return f"{config.task}/{self.variant}/{config.algorithm}-{config.seed}"
 
+    @property
+    def training(self):
+        """The class that trains it: Training, TD3Training, or a faulty one."""
+        from dnddpg_minimal.bugs import BUGS
+        from dnddpg_minimal.td3 import TD3Training
+
+        if self.bug is not None:
+            return BUGS[self.bug][2]
+        return TD3Training if self.variant == "td3" else Training
+
 
 def list_of(budget):
     """The runs of a budget, in the order of doing: seed 0 of everything first.
@@ -176,6 +186,8 @@ def _class():
     runs += _many(5, walker, ddpg, "hidden=186-186", hidden=(186, 186))
     runs += _many(10, (*pendulum, *hard, *cheetah, *hopper), dcn, "updates_per_step=2",
                   updates_per_step=2)
+    # The rest of TD3: smoothing and delay
+    runs += _many(10, (*cheetah, *hopper, *walker), dcn, "td3", target_every=2)
     runs += _many(10, pendulum, ALGORITHMS, "frozen", freeze_actors_after=20_000)
     runs += _many(1, (*cheetah, *hopper), ALGORITHMS, "frozen", **frozen)
     runs += _many(1, (*walker, *others), dn, "frozen", **frozen)
@@ -450,11 +462,7 @@ class Checkpoint:
 
     def load(self):
         """Training and Notes as they were saved; new ones if there are none of use."""
-        kind = Training
-        if self.run.bug is not None:
-            from dnddpg_minimal.bugs import BUGS
-
-            kind = BUGS[self.run.bug][2]
+        kind = self.run.training
         with suppress(FileNotFoundError, ValueError, KeyError):
             training = kind.load(self.training)
             return training, Notes.load(self.notes, training.step)
@@ -560,7 +568,7 @@ def revision():
 @cache
 def code():
     """A digest of the files that decide what a run does."""
-    files = ("dnddpg.py", "arm.py", "bias.py", "bugs.py")
+    files = ("dnddpg.py", "arm.py", "bias.py", "bugs.py", "td3.py")
     parts = (Path(__file__).with_name(name).read_bytes() for name in files)
     return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 

@@ -35,6 +35,7 @@ from dnddpg_minimal import (
     study,
     to_env,
 )
+from dnddpg_minimal.td3 import TD3Training
 
 pytestmark = pytest.mark.slow
 
@@ -128,6 +129,10 @@ def test_the_class_budget_is_the_issues_list():
     assert count("Pendulum-v1/ablation=") == 15
     assert count("Pendulum-v1/bug=") == 25 and "bug=no_end" in " ".join(names)
     assert count("HalfCheetah-v5/400-300/") == 3
+    for task in ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5"):
+        assert count(f"{task}/td3/DCN-DDPG-") == 10
+    for task in ("Pendulum-v1", "ArmHard-v0", "HalfCheetah-v5", "Hopper-v5"):
+        assert count(f"{task}/updates_per_step=2/DCN-DDPG-") == 10
 
 
 def test_a_control_has_as_many_weights_as_the_agent_it_stands_for():
@@ -940,10 +945,7 @@ def test_a_faulty_agent_refuses_what_it_was_not_written_for():
         bugs.LostAxis(tiny("DN-DDPG").config)
 
 
-@pytest.mark.parametrize("bug", bugs.BUGS)
-def test_a_bug_trains_silently_differs_and_resumes(bug, tmp_path):
-    task, fields, _ = bugs.BUGS[bug]
-    run = tiny("DDPG", task=task, bug=bug, **fields, steps=400, evaluate_every=400)
+def repeats_when_stopped(run, tmp_path):
     stop = SPAWN.Event()
     stop.set()
     study.record(run, tmp_path, tmp_path / "a")
@@ -953,6 +955,28 @@ def test_a_bug_trains_silently_differs_and_resumes(bug, tmp_path):
         if what == "done":
             break
     assert_same_record(path_of(run, tmp_path), path_of(run, tmp_path / "b"))
+
+
+@pytest.mark.parametrize("bug", bugs.BUGS)
+def test_a_bug_trains_silently_differs_and_resumes(bug, tmp_path):
+    task, fields, _ = bugs.BUGS[bug]
+    run = tiny("DDPG", task=task, bug=bug, **fields, steps=400, evaluate_every=400)
+    repeats_when_stopped(run, tmp_path)
+
+
+def test_a_run_of_td3_is_td3s_and_resumes(tmp_path):
+    run = tiny("DCN-DDPG", steps=400, evaluate_every=400, target_every=2)
+    run = run._replace(variant="td3")
+    repeats_when_stopped(run, tmp_path)
+    training = TD3Training(run.config)
+    list(training)
+    found = json.loads(str(study.read_npz(path_of(run, tmp_path))["meta"]))
+    assert found["updates"] == training.updates
+    same = run._replace(variant="dcn")
+    study.record(same, tmp_path, tmp_path / "a")
+    one, other = (study.read_npz(path_of(r, tmp_path))["evaluations"]
+                  for r in (run, same))
+    assert not np.array_equal(one, other, equal_nan=True)
 
 
 def test_ablations_differ_from_the_class_run_in_one_field():

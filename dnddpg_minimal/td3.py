@@ -1,0 +1,43 @@
+"""TD3 (Fujimoto et al. 2018): DCN-DDPG with smoothed targets and delayed actors.
+
+The paper stops at the second critic, the first of TD3's three parts. These are the
+other two, as chapter 12 explains them, in the way that anybody adds an agent of their
+own: a subclass that overrides what differs. No line of dnddpg.py changes.
+
+    from dnddpg_minimal import Config
+    from dnddpg_minimal.td3 import TD3Training
+
+    training = TD3Training(Config("Hopper-v5", "DCN-DDPG", target_every=2))
+
+`target_every=2` delays the slow copies, too, as TD3 does.
+"""
+
+import numpy as np
+
+from dnddpg_minimal.dnddpg import NumpyAgent, Training
+
+
+class TD3Agent(NumpyAgent):
+    """DCN-DDPG with smoothed targets and delayed actors; Config(target_every=2)."""
+
+    sigma, limit, every = 0.2, 0.5, 2  # in half action ranges; updates
+
+    def q_next(self, next_obs):
+        """Slow critics near the slow actors' actions, Eq. (12.5): (C, K, B)."""
+        rng = np.random.default_rng([self.config.seed, self.updates])
+        actions = self.actions(next_obs, slow=True)  # (K, B, A)
+        noise = rng.normal(0, self.sigma, actions.shape)
+        noise = np.clip(noise, -self.limit, self.limit)
+        actions = np.clip(actions + noise, -1, 1).astype(self.dtype)
+        return self._q(np.asarray(next_obs, self.dtype), actions, slow=True)
+
+    def update(self, batch, climb=True):
+        """As `Agent.update`; the actors climb at every second one only."""
+        due = (self.updates + 1) % self.every == 0  # as for the slow copies
+        return super().update(batch, climb and due)
+
+
+class TD3Training(Training):
+    """Trains `TD3Agent`."""
+
+    agent_class = TD3Agent
