@@ -1,11 +1,16 @@
 """The chapters as files: they are as `book` writes them; measuring changes nothing."""
 
+import base64
+import io
 import re
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import nbformat
+import numpy as np
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+from PIL import Image
 
 from dnddpg_minimal import book
 from dnddpg_minimal.__main__ import main
@@ -33,6 +38,32 @@ def test_the_picture_at_the_top_is_the_chapters_last_figure(path):
     shown = path.parent / top[0]  # 00 shows another chapter's
     whose = nbformat.read(path.parent / f"{shown.stem}.ipynb", as_version=4)
     assert shown.read_bytes() == book.pictures(whose)[-1]
+
+
+@by_name
+def test_a_stored_picture_has_a_palette(path):
+    notebook = nbformat.read(path, as_version=4)
+    for png in book.pictures(notebook):
+        assert Image.open(io.BytesIO(png)).mode == "P"
+
+
+def test_a_palette_makes_a_figure_smaller_and_changes_no_colour_that_one_sees():
+    _, ax = plt.subplots(figsize=(7, 3))
+    x = np.linspace(0, 6, 200)
+    for shift in range(8):
+        ax.plot(x, np.sin(x + shift))
+    ax.imshow(np.add.outer(x, x), extent=(0, 6, -1, 1), cmap="cividis", aspect="auto")
+    whole = io.BytesIO()
+    plt.savefig(whole, dpi=100)
+    plt.close()
+    png = base64.b64encode(whole.getvalue()).decode()
+    smaller = book.with_palette(png)
+    assert len(smaller) < 0.6 * len(png)
+    one, other = (np.asarray(Image.open(io.BytesIO(base64.b64decode(p))).convert("RGB"),
+                             float) for p in (png, smaller))
+    assert one.shape == other.shape and np.abs(one - other).mean() < 2  # of 255
+    assert np.abs(one - other).max() < 25
+    assert book.with_palette(smaller) == smaller
 
 
 def small_chapter(folder, *cells):

@@ -39,7 +39,7 @@ def test_all_figures_grow_with_the_dots_of_the_page(monkeypatch):
     monkeypatch.setitem(plt.rcParams, "figure.dpi", 180)
     steps = {"Pendulum-v1": {"DDPG": (np.arange(3), np.ones((2, 3)))}}
     plots.plot_eight_tasks(steps)
-    assert plt.gcf().dpi == 140  # 70 on the page
+    assert plt.gcf().dpi == 180
 
 
 def test_each_algorithm_has_a_colour_and_a_kind_of_line_of_its_own():

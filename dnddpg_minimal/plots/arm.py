@@ -15,7 +15,6 @@ from dnddpg_minimal.plots.style import (
     TWO,
     VALUES,
     pale,
-    small,
     thousands,
 )
 
@@ -175,7 +174,7 @@ def plot_reaching(tables, columns, references=None, log=(), axes=None, title="")
     """
     if axes is None:
         figure, axes = plt.subplots(len(tables), len(columns), figsize=(6, 3.1),
-                                    squeeze=False, sharex=True, dpi=small(75),
+                                    squeeze=False, sharex=True,
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for r, (task, table) in enumerate(tables.items()):
@@ -186,7 +185,7 @@ def plot_reaching(tables, columns, references=None, log=(), axes=None, title="")
                 style = STYLE[name]
                 if seeds.shape[1] > 1:
                     ax.plot(seeds.index, seeds, color=pale(style["color"]),
-                            linewidth=0.6, antialiased=False)
+                            linewidth=0.6)
                 ax.plot(seeds.index, seeds.mean(axis=1), label=name, linewidth=1.8,
                         zorder=3, **style)
             if (task, column) in (references or {}):
@@ -217,7 +216,7 @@ def plot_joint_errors(pictures, limit, axes=None, title=""):
     if axes is None:
         figure, axes = plt.subplots(rows, columns, sharex=True, sharey=True,
                                     figsize=(1.75 * columns + 1.2, 1.6 * rows + 0.5),
-                                    squeeze=False, layout="constrained", dpi=small(82))
+                                    squeeze=False, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for r, (task, maps) in enumerate(pictures.items()):
         for ax in axes[r, len(maps):]:

@@ -67,9 +67,7 @@ def plot_over_training(table, columns, log=(), limits=None, axes=None, title="")
         for name, runs in table.groupby("algorithm", sort=False):
             seeds = runs.pivot(index="step", columns="seed", values=column).dropna()
             style = STYLE[name]
-            # Pale and without smooth edges: few colours, a small file.
-            ax.plot(seeds.index, seeds, color=pale(style["color"]), linewidth=0.6,
-                    antialiased=False)
+            ax.plot(seeds.index, seeds, color=pale(style["color"]), linewidth=0.6)
             ax.plot(seeds.index, seeds.mean(axis=1), linewidth=2, label=name, **style,
                     zorder=3)
         ax.set(xlabel="environment steps", ylabel=label)

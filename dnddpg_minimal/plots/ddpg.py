@@ -114,9 +114,7 @@ def plot_ablations(runs, whole, axes=None, title=""):
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for ax, (name, (steps, returns)) in zip(axes, runs.items(), strict=True):
-        # Pale and without smooth edges: few colours, a small file.
-        ax.plot(steps, returns.T, color=pale(WRONG["color"], 0.7), linewidth=0.7,
-                antialiased=False)
+        ax.plot(steps, returns.T, color=pale(WRONG["color"], 0.7), linewidth=0.7)
         ax.plot(whole[0], whole[1].mean(axis=0), linewidth=1.8, label="whole DDPG",
                 **STYLE["DDPG"])
         ax.plot(steps, returns.mean(axis=0), label="one part missing", **WRONG)

@@ -10,7 +10,6 @@ from dnddpg_minimal.plots.style import (
     TRUTH,
     TWO,
     pale,
-    small,
     thousands,
 )
 
@@ -38,7 +37,7 @@ def plot_eight_tasks(curves, interval=None, seeds=False, limits=None, xlabel="",
     if axes is None:
         rows = -(-len(curves) // 4)
         figure, axes = plt.subplots(rows, min(4, len(curves)), squeeze=False,
-                                    figsize=(7, 1.55 * rows + 0.4), dpi=small(70),
+                                    figsize=(7, 1.55 * rows + 0.4),
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
         figure.supxlabel(xlabel, fontsize=9)
@@ -53,15 +52,14 @@ def plot_eight_tasks(curves, interval=None, seeds=False, limits=None, xlabel="",
         if not of_algorithms:
             not_recorded(ax, task)
         for name, (x, values) in of_algorithms.items():
-            style = STYLE[name]  # lines without smooth edges: few colours, a small file
+            style = STYLE[name]
             if interval is not None and len(values) >= FEWEST:
                 ax.fill_between(x, *interval(values), color=pale(style["color"], 0.6),
-                                alpha=0.55, linewidth=0, antialiased=False)
+                                alpha=0.55, linewidth=0)
             if seeds:
-                ax.plot(x, values.T, color=pale(style["color"], 0.45), linewidth=0.4,
-                        antialiased=False)
+                ax.plot(x, values.T, color=pale(style["color"], 0.45), linewidth=0.4)
             ax.plot(x, values.mean(axis=0), linewidth=1.2, zorder=3, label=name,
-                    antialiased=False, **style)
+                    **style)
         if of_algorithms:
             ax.xaxis.set_major_locator(plt.MaxNLocator(2))
             ax.yaxis.set_major_locator(plt.MaxNLocator(3))

@@ -13,7 +13,6 @@ from dnddpg_minimal.plots.style import (
     TWO,
     VALUES,
     draw_map,
-    small,
 )
 
 GOAL = 0.45  # position of the flag
@@ -28,12 +27,11 @@ def plot_energy_paths(x, y, energy, paths, ax=None, title=""):
     three; each begins at a ring and ends at a star.
     """
     if ax is None:
-        _, ax = plt.subplots(figsize=(6.2, 3.4), layout="constrained", dpi=small(75))
-    ax.contour(x, y, energy, [0.1, 0.25, 0.5, 0.75], colors="0.8", linewidths=0.8,
-               antialiased=False)
+        _, ax = plt.subplots(figsize=(6.2, 3.4), layout="constrained")
+    ax.contour(x, y, energy, [0.1, 0.25, 0.5, 0.75], colors="0.8", linewidths=0.8)
     goal_line(ax, x, y, energy)
     for (label, path), style in zip(paths.items(), (ONE, TWO, THREE)):
-        ax.plot(*np.transpose(path), label=label, antialiased=False, **style)
+        ax.plot(*np.transpose(path), label=label, **style)
         for row, marker, size in ((0, "o", 7), (-1, "*", 13)):
             ax.plot(*path[row], marker, markersize=size, markerfacecolor="white",
                     markeredgecolor=style["color"], markeredgewidth=1.5, zorder=4)
@@ -49,8 +47,7 @@ def goal_line(ax, x, y, energy, color="black"):
     x (N,), y (M,) and energy (M, N) as in `plot_energy_paths`.
     """
     energy = np.where(x > GOAL + 0.01, np.nan, energy)  # beyond it the hill falls again
-    ax.contour(x, y, energy, [1.0], colors=color, linewidths=1.6, linestyles="--",
-               antialiased=False)
+    ax.contour(x, y, energy, [1.0], colors=color, linewidths=1.6, linestyles="--")
     ax.axvline(GOAL, color=color, linewidth=1, linestyle=":")
 
 
@@ -63,12 +60,12 @@ def plot_pushes(cases, axes=None, title=""):
     if axes is None:
         height = 1.5 * len(cases) + 0.8
         figure, axes = plt.subplots(len(cases), 2, figsize=(7.4, height), sharex="col",
-                                    sharey="col", squeeze=False, dpi=small(75),
+                                    sharey="col", squeeze=False,
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for row, (label, (push, position)), style in zip(axes, cases.items(),
                                                      (TWO, ONE, THREE)):
-        plain = style | {"linestyle": "-", "linewidth": 1, "antialiased": False}
+        plain = style | {"linestyle": "-", "linewidth": 1}
         row[0].plot(push[:200], **plain)
         row[0].axhline(0, **TRUTH)
         row[0].set_ylabel(f"{label}\npush", fontsize=8.5)
@@ -97,7 +94,7 @@ def plot_climbing(predicted, measured, best, usual, axes=None, title=""):
     """
     if axes is None:
         figure, axes = plt.subplots(1, 2, figsize=(7.4, 2.8), sharex=True,
-                                    dpi=small(75), layout="constrained")
+                                    layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     axes[0].plot(*predicted, color="black", linewidth=1.8)
     axes[0].axhline(1, color=GREY, linewidth=1)
@@ -162,7 +159,7 @@ def plot_found_or_not(pictures, axes=None, title=""):
     if axes is None:
         figure, axes = plt.subplots(len(pictures), 3, sharex=True, sharey=True,
                                     figsize=(7.6, 1.9 * len(pictures) + 0.8),
-                                    dpi=small(75), squeeze=False, layout="constrained")
+                                    squeeze=False, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for row, (label, picture) in zip(axes, pictures.items()):
         q, truth = picture["q"][0], picture["truth"]

@@ -21,7 +21,6 @@ from dnddpg_minimal.plots.style import (
     TRUTH,
     TWO,
     pale,
-    small,
 )
 
 CAMERA = dict(azimuth=90, elevation=-8)  # from the side, a little from above, degrees
@@ -236,7 +235,7 @@ def plot_live(episodes, evaluations, q, truth, random, axes=None, title=""):
     """
     if axes is None:
         figure, axes = plt.subplots(1, 2, figsize=(7.4, 3), layout="constrained",
-                                    width_ratios=(5, 4), dpi=small(80))
+                                    width_ratios=(5, 4))
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     plot_learning(episodes, evaluations, random, ax=axes[0])
     axes[0].legend(loc="upper left", fontsize=8)
@@ -276,9 +275,8 @@ def four_panels(rows=1, height=2.6, title=""):
 
     Returns (figure, axes (rows, 4)).
     """
-    # Few dots, and no smooth edges where lines are many: a small file
     figure, axes = plt.subplots(rows, 4, figsize=(7.6, height), sharex=True,
-                                squeeze=False, layout="constrained", dpi=small(72))
+                                squeeze=False, layout="constrained")
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     return figure, axes
 
@@ -294,10 +292,10 @@ def draw_runs(ax, table, column):
         alone = seeds.shape[1] == 1  # one seed is its own mean
         if not alone:
             ax.plot(seeds.index, seeds, color=pale(style["color"], 0.55),
-                    linewidth=0.6, antialiased=False, zorder=1)
+                    linewidth=0.6, zorder=1)
         # The mean only where all seeds were measured: else it jumps
         mean = seeds.mean(axis=1, skipna=False)
-        ax.plot(seeds.index, mean, label=name, antialiased=False, linewidth=1.1,
+        ax.plot(seeds.index, mean, label=name, linewidth=1.1,
                 **style)
 
 

@@ -14,7 +14,6 @@ from dnddpg_minimal.plots.style import (
     TRUTH,
     TWO,
     draw_map,
-    small,
     thousands,
 )
 
@@ -126,7 +125,7 @@ def plot_error_and_share(pictures, limit, axes=None, title=""):
     """
     if axes is None:
         figure, axes = plt.subplots(2, len(pictures), figsize=(7, 3.2), sharex=True,
-                                    sharey=True, layout="constrained", dpi=small(70))
+                                    sharey=True, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for n, (step, picture) in enumerate(pictures.items()):
         error = picture["error"]
@@ -159,13 +158,13 @@ def plot_owed(table, owed, control, debt, axes=None, title=""):
     """
     if axes is None:
         figure, axes = plt.subplots(1, 2, figsize=(7.2, 2.7), layout="constrained",
-                                    width_ratios=(3, 2), dpi=small(70))  # a small file
+                                    width_ratios=(3, 2))
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     ax, right = axes
     for name, runs in table.groupby("algorithm", sort=False):
         seeds = runs.pivot(index="step", columns="seed", values="bias")
         if name == "DDPG":
-            ax.plot(seeds, color="#F0B58A", linewidth=0.8, antialiased=False)
+            ax.plot(seeds, color="#F0B58A", linewidth=0.8)
         ax.plot(seeds.mean(axis=1), linewidth=2, label=name, **STYLE[name])
     ax.plot(*owed, color="0.5", linewidth=3, linestyle=(0, (1, 1)),
             label="owed by DDPG")

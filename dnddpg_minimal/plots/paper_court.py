@@ -51,7 +51,7 @@ def plot_who_acts(constants, share, lost, axes=None, title=""):
             "share of states\nin which actor 2 acts", "true value lost by the choice")):
         for (rule, values), style in zip(curves.items(), (ONE, TWO, THREE)):
             ax.plot(constants, np.transpose(values), linewidth=0.6,
-                    color=pale(style["color"]), antialiased=False)
+                    color=pale(style["color"]))
             ax.plot(constants, np.mean(values, axis=0), label=rule, **style)
         ax.set(xlabel="constant added to critic 2", ylabel=label)
     axes[0].set_ylim(-0.03, 1.03)
@@ -151,13 +151,12 @@ def plot_consequences(found, expected=None, axes=None, title=""):
     for ax, (quantity, readings) in zip(axes, found.items()):
         ax.axvline(0, **TRUTH)
         for n, (values, interval) in enumerate(readings.values()):
-            # Without smooth edges: few colours, a small file.
             ax.plot(values, np.full(len(values), n), "|", markersize=7, color="0.45",
-                    antialiased=False, markeredgewidth=1.4)
+                    markeredgewidth=1.4)
             if interval is not None:
                 sure = interval[0] > 0 or interval[1] < 0
                 color = "#AA3377" if sure else "black"
-                ax.plot(interval, [n, n], color=color, linewidth=2, antialiased=False)
+                ax.plot(interval, [n, n], color=color, linewidth=2)
                 ax.plot(np.mean(values), n, "D", color=color, markersize=4.5)
         for name, value in (expected or {}).get(quantity, {}).items():
             ax.plot(value, rows.index(name), "x", markersize=7, markeredgewidth=2,

@@ -11,7 +11,6 @@ from dnddpg_minimal.plots.style import (
     TRUTH,
     TWO,
     pale,
-    small,
     thousands,
 )
 
@@ -29,7 +28,7 @@ def plot_line_up(agents, axes=None, title=""):
     rows = 2 * -(-len(agents) // 3)
     if axes is None:
         figure, axes = plt.subplots(rows, 3, figsize=(7.6, 1.3 * rows + 0.8),
-                                    dpi=small(72), layout="constrained", squeeze=False)
+                                    layout="constrained", squeeze=False)
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for n, (letter, agent) in enumerate(agents.items()):
         above, below = axes[2 * (n // 3):2 * (n // 3) + 2, n % 3]
@@ -44,13 +43,12 @@ def plot_line_up(agents, axes=None, title=""):
             continue
         step, runs = agent["right"]
         above.fill_between(step, runs.min(axis=0), runs.max(axis=0), color="0.8",
-                           linewidth=1.5, antialiased=False)
+                           linewidth=1.5)
         step, runs = agent["tests"]
-        above.plot(step, np.transpose(runs), color=THREE["color"], linewidth=1.5,
-                   antialiased=False)
+        above.plot(step, np.transpose(runs), color=THREE["color"], linewidth=1.5)
         step, q, truth = agent["q"]
-        below.plot(step, truth, antialiased=False, **TRUTH)
-        below.plot(step, q, antialiased=False, **STYLE["DDPG"], linewidth=1.8)
+        below.plot(step, truth, **TRUTH)
+        below.plot(step, q, **STYLE["DDPG"], linewidth=1.8)
         above.set_xticklabels([])
         low, high = above.get_ylim()
         if high - low < 50:  # hardly any change: do not enlarge it
@@ -85,7 +83,7 @@ def plot_practice(agents, axes=None, title=""):
     rows = -(-len(agents) // columns)
     if axes is None:
         figure, axes = plt.subplots(rows, columns, figsize=(7.8, 1.7 * rows + 0.5),
-                                    layout="constrained", squeeze=False, dpi=small(75))
+                                    layout="constrained", squeeze=False)
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     every = np.ravel(axes)
     for ax in every[len(agents):]:
@@ -114,7 +112,7 @@ def plot_questions(groups, axes=None, title=""):
     """
     widths = [len(agents) for agents in groups.values()]
     if axes is None:
-        figure, axes = plt.subplots(1, len(groups), figsize=(7.4, 2.9), dpi=small(75),
+        figure, axes = plt.subplots(1, len(groups), figsize=(7.4, 2.9),
                                     width_ratios=widths, squeeze=False,
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")

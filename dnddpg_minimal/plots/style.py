@@ -22,7 +22,7 @@ ONE = dict(color="#E69F00", linestyle="-", linewidth=2)  # lines of no algorithm
 TWO = dict(color="#56B4E9", linestyle="--", linewidth=2)
 THREE = dict(color="#CC79A7", linestyle=":", linewidth=2.4)
 
-DPI = 90  # of a figure on the page; `plt.rcParams["figure.dpi"] = 150` is for a wall
+DPI = 100  # of a figure on the page; `plt.rcParams["figure.dpi"] = 150` is for a wall
 plt.rcParams.update({
     "figure.dpi": DPI,
     "font.size": 9,
@@ -33,11 +33,6 @@ plt.rcParams.update({
     "legend.frameon": False,
     "legend.fontsize": 8.5,
 })
-
-
-def small(dpi):
-    """The dots an inch of a large figure: `dpi` on the page, more on a wall."""
-    return dpi * plt.rcParams["figure.dpi"] / DPI
 
 
 def style_of(label):
