@@ -57,13 +57,12 @@ def plot_over_training(table, columns, log=(), limits=None, axes=None, title="")
     which something was not measured (NaN) are passed over.
     """
     if axes is None:
-        figure, axes = plt.subplots(1, len(columns), figsize=(6.2, 2.5), squeeze=False,
+        figure, axes = plt.subplots(1, len(columns), figsize=(7, 2.7), squeeze=False,
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for ax, (column, label) in zip(np.ravel(axes), columns.items()):
         if column == "bias":
             ax.axhline(0, **TRUTH)
-            label = f"{label}\n{SIGN_TURNED}"
         for name, runs in table.groupby("algorithm", sort=False):
             seeds = runs.pivot(index="step", columns="seed", values=column).dropna()
             style = STYLE[name]
@@ -71,10 +70,13 @@ def plot_over_training(table, columns, log=(), limits=None, axes=None, title="")
             ax.plot(seeds.index, seeds.mean(axis=1), linewidth=2, label=name, **style,
                     zorder=3)
         ax.set(xlabel="environment steps", ylabel=label)
-        ax.yaxis.label.set_size(7.5 if column == "bias" else 9)
         if column in log:
             ax.set_yscale("log")
         ax.set_ylim((limits or {}).get(column))
+        if column == "bias":
+            low, high = ax.get_ylim()
+            ax.set_ylim(low - 0.08 * (high - low), high)  # room for the words
+            note_sign(ax)
         ax.xaxis.set_major_locator(plt.MaxNLocator(4))
         thousands(ax)
     if table.algorithm.nunique() > 1:
@@ -102,9 +104,16 @@ def plot_parts(parts, ax=None, title=""):
                     markerfacecolor="white", markeredgecolor=style["color"])
     ax.set_xticks(range(3), ["critic above its targets", "rule of the target",
                              "sum = bias"])
-    ax.set(title=title, ylabel="mean over start states", xlim=(-0.5, 2.9))
+    ax.set(title=title, ylabel="part of Q − truth,\nmean over start states",
+           xlim=(-0.5, 2.9))
     legend_below(ax)
     return ax
+
+
+def note_sign(ax):
+    """Write which side of zero is which into the corner at the lower right."""
+    ax.annotate(SIGN, (0.995, 0.02), xycoords="axes fraction", ha="right",
+                fontsize=8.5)
 
 
 def note_mean(ax, error):
@@ -133,7 +142,7 @@ def plot_mean_planes(planes, limit, axes=None, title=""):
             image = draw_map(ax, picture, shades, ERRORS, -limit, limit)
             note_mean(ax, picture["error"])
             if np.allclose(picture["x"][-1], np.pi, atol=0.01):
-                angle_ticks(ax)
+                angle_ticks(ax, every=2)
             if r == 0:
                 ax.set_title(f"step {step:,}".replace(",", " "), loc="center",
                              fontsize=9)
@@ -186,5 +195,6 @@ def plot_differences_by_seed(differences, predicted=None, axes=None, title=""):
         ax.set(xlabel=label, ylim=(len(pairs) - 0.5, -0.5))
         shown = dict(zip(*reversed(ax.get_legend_handles_labels())))  # each label once
         if shown:
-            ax.legend(shown.values(), shown, loc="best", fontsize=8)
+            ax.legend(shown.values(), shown, loc="lower right",  # above the axes
+                      bbox_to_anchor=(1, 1), borderpad=0)
     return axes

@@ -194,13 +194,16 @@ def plot_error_plane(picture, critic=0, axes=None, title="", limit=None):
     low, high = min(q.min(), truth.min()), max(q.max(), truth.max())
     draw_map(axes[0], picture, truth, VALUES, low, high)
     image = draw_map(axes[1], picture, q, VALUES, low, high)
-    axes[0].figure.colorbar(image, ax=axes[:2])
+    bar = axes[0].figure.colorbar(image, ax=axes[:2])
+    bar.set_label("value (discounted return)", fontsize=8)
     image = draw_map(axes[2], picture, error, ERRORS, -limit, limit)
     bar = axes[0].figure.colorbar(image, ax=axes[2], extend="both")
     # Turned by 90 degrees, the arrows point down and up.
-    bar.set_label("← underestimates    overestimates →", fontsize=8)
+    bar.set_label("← under    over →", fontsize=8)
     for ax, name in zip(axes, ("the truth", "what the critic says", "Q − truth"),
                         strict=True):
         ax.set_title(name, loc="center", fontsize=9)
+        if is_angle(picture["x"]):
+            angle_ticks(ax, every=2)
     axes[0].set_ylabel("velocity")
     return axes

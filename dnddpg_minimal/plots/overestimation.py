@@ -3,16 +3,16 @@
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dnddpg_minimal.plots.critics import note_mean
+from dnddpg_minimal.plots.critics import note_mean, note_sign
 from dnddpg_minimal.plots.style import (
     ERRORS,
     GREY,
     ONE,
-    SIGN_TURNED,
     STYLE,
     THREE,
     TRUTH,
     TWO,
+    angle_ticks,
     draw_map,
     thousands,
 )
@@ -34,7 +34,8 @@ def plot_y(y, expected=None, ax=None, title=""):
         ax.axvline(expected, color="black", linestyle=":", linewidth=1.8,
                    label=f"closed form {expected:+.2f}")
     ax.set(title=title, xlabel="what the target says − truth", yticks=[], xlim=(-6, 8))
-    ax.legend(loc="upper left")
+    ax.spines["left"].set_visible(False)  # beside the truth it looks like a second one
+    ax.legend(loc="upper left" if y.mean() > 2 else "upper right", handlelength=1.5)
     return ax
 
 
@@ -112,7 +113,7 @@ def plot_steps(curves, points, axes=None, title=""):
         ax.set(xlabel="action")
         ax.set_title(name, loc="center", fontsize=9, pad=10)
     np.ravel(axes)[0].set_ylabel("value")
-    np.ravel(axes)[0].legend(loc="center right", bbox_to_anchor=(1, 0.72))
+    np.ravel(axes)[0].legend(loc="center", bbox_to_anchor=(0.5, 0.3))
     return axes
 
 
@@ -136,7 +137,9 @@ def plot_error_and_share(pictures, limit, axes=None, title=""):
         axes[0, n].set_title(f"step {step:,}".replace(",", " "), loc="center",
                              fontsize=9)
         axes[0, n].set_xlabel("")
-        axes[1, n].set_xlabel("" if n else "angle (0 is upright)")
+        axes[1, n].set_xlabel("")
+        angle_ticks(axes[1, n], every=2)
+    axes[0, 0].figure.supxlabel("angle (0 is upright)", fontsize=9)
     for row in axes:
         row[0].set_ylabel("velocity")
     figure = axes[0, 0].figure
@@ -173,7 +176,8 @@ def plot_owed(table, owed, control, debt, axes=None, title=""):
     ax.set_yticks(ticks, ["−40", "−20", "0", "+20", "+40", "+600"])
     ax.set_yticks([], minor=True)
     ax.set(xlabel="environment steps", xticks=[0, 20_000, 40_000], ylim=(-45, 9_000))
-    ax.set_ylabel(f"Q − truth, start states\n{SIGN_TURNED}", fontsize=8)
+    ax.set_ylabel("Q − truth, start states")
+    note_sign(ax)
     ax.legend(loc="upper right", ncols=2)
 
     for (label, (updates, runs)), style in zip(control.items(), (ONE, TWO)):

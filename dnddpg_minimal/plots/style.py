@@ -99,10 +99,10 @@ def is_angle(x):
     return np.allclose((x[0], x[-1]), (-np.pi, np.pi), atol=0.01)  # recorded: float16
 
 
-def angle_ticks(ax):
-    """Ticks at multiples of π/2 on the x axis."""
-    ax.set_xticks([-np.pi, -np.pi / 2, 0, np.pi / 2, np.pi],
-                  ["−π", "−π/2", "0", "π/2", "π"])
+def angle_ticks(ax, every=1):
+    """Ticks at multiples of π/2 on the x axis; of π, in a small panel, if every=2."""
+    ax.set_xticks([-np.pi, -np.pi / 2, 0, np.pi / 2, np.pi][::every],
+                  ["−π", "−π/2", "0", "π/2", "π"][::every])
 
 
 def zero_line(ax):

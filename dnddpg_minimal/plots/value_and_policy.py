@@ -37,18 +37,19 @@ def plot_true_q(position, action, q, lines, axes=None, title=""):
     position (X,), action (Y,), q (Y, X); lines: a dict from a label to actions (X,).
     """
     if axes is None:
-        figure = plt.figure(figsize=(6, 2.3), layout="constrained")
+        figure = plt.figure(figsize=(7, 2.8), layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
         axes = figure.add_subplot(1, 2, 1, projection="3d"), figure.add_subplot(1, 2, 2)
     hill, flat = axes
     hill.plot_surface(*np.meshgrid(position, action), q, edgecolor="white",
                       cmap=plt.get_cmap(VALUES, 12), rcount=9, ccount=9, linewidth=0.4)
-    hill.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1], zticks=[-4, -2, 0])
+    # The near corner has one label: two would meet there.
+    hill.set(xticks=[-1, 0, 1], yticks=[0, 1], zticks=[-4, -2, 0])
     hill.set_box_aspect(None, zoom=1.15)
     hill.tick_params(pad=-3)
     hill.grid(False)
     for axis, name in zip((hill.xaxis, hill.yaxis, hill.zaxis),
-                          ("position", "action", "")):  # the colour bar says "true Q"
+                          ("position", "action", "true Q")):
         axis.set_label_text(name)
         axis.labelpad = -6
         axis.pane.set_visible(False)
@@ -58,7 +59,7 @@ def plot_true_q(position, action, q, lines, axes=None, title=""):
         flat.plot(position, actions, color="white", linewidth=3.5)
         flat.plot(position, actions, color="black", linestyle=style, label=label)
     flat.set(xlabel="position", ylabel="action", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
-    flat.legend(loc="lower left", fontsize=8, frameon=True)
+    flat.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2)
     return axes
 
 
