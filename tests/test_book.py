@@ -47,6 +47,16 @@ def test_a_stored_picture_has_a_palette(path):
         assert Image.open(io.BytesIO(png)).mode == "P"
 
 
+@by_name
+def test_what_a_cell_prints_fits_the_page(path):
+    """JupyterLab breaks longer lines anywhere, within words and numbers too."""
+    for cell in nbformat.read(path, as_version=4).cells:
+        for output in cell.get("outputs", []):
+            long = [line for line in output.get("text", "").splitlines()
+                    if len(line) > 100]
+            assert not long, f"{cell.id}: {long[0]}"
+
+
 def test_a_palette_makes_a_figure_smaller_and_changes_no_colour_that_one_sees():
     _, ax = plt.subplots(figsize=(7, 3))
     x = np.linspace(0, 6, 200)

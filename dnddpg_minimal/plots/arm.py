@@ -161,6 +161,7 @@ def plot_fastest(steps, start, ends, counts, axes=None, title=""):
         beside = elbow + 0.5 * (elbow - finger / 2)  # on the outer side of the elbow
         axes[1].annotate(f"{count:.0f} steps", beside, ha="center", va="center",
                          fontsize=8.5)
+    axes[1].set_xlabel("px from the base")
     return axes
 
 
@@ -222,15 +223,12 @@ def plot_joint_errors(pictures, limit, axes=None, title=""):
         for ax in axes[r, len(maps):]:
             ax.axis("off")
         for ax, (name, error) in zip(axes[r], maps.items()):
-            # Few shades, a small file; none is white, so that the sign is always seen
+            # Few shades, and none is white, so that the sign is always seen
             shades = (np.floor(error / limit * 4) + 0.5) / 4 * limit
             image = draw_joints(ax, shades, ERRORS, -limit, limit)
             draw_goal_over_joints(ax)
-            mean = f"mean {error.mean():+.2f}".replace("-", "−")
-            ax.annotate(mean, (0.96, 0.04), xycoords="axes fraction", ha="right",
-                        fontsize=8, bbox=dict(facecolor="white", edgecolor="none",
-                                              pad=1))
-            ax.set_title(name, loc="center", fontsize=9)
+            mean = f"{round(error.mean(), 2) + 0.0:+.2f}".replace("-", "−")
+            ax.set_title(f"{name}, mean {mean}", loc="center", fontsize=8.5)
             if r == rows - 1:
                 ax.set_xlabel("joint 1")
         axes[r, 0].set_ylabel(f"{task}\njoint 2")
@@ -286,10 +284,11 @@ def plot_hovering(worth, counters, axes=None, title=""):
     for ax, (label, counter) in zip(traces, counters.items()):
         ax.plot(np.arange(1, len(counter) + 1), counter, color=THREE["color"],
                 linewidth=1.3)
-        ax.axhline(arm.HOLD + 0.5, **TRUTH)
-        ax.set(xlim=(0, 300), ylim=(0, 58), yticks=[0, 50])
+        ax.axhline(arm.HOLD + 1, **TRUTH)  # success
+        ax.set(xlim=(0, 300), ylim=(0, 58), yticks=[0, arm.HOLD + 1])
         ax.set_title(label, fontsize=8.5, pad=2)
         if ax is not traces[-1]:
             ax.set_xticklabels([])
+    traces[len(traces) // 2].set_ylabel("steps in a row\non the goal", fontsize=8.5)
     traces[-1].set_xlabel("step of the episode")
     return axes

@@ -41,6 +41,7 @@ def plot_eight_tasks(curves, interval=None, seeds=False, limits=None, xlabel="",
                                     layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
         figure.supxlabel(xlabel, fontsize=9)
+        figure.supylabel("return of an episode", fontsize=9)
     for n, (ax, (task, of_algorithms)) in enumerate(zip(np.ravel(axes),
                                                         curves.items())):
         counts = [len(values) for _, values in of_algorithms.values()]
@@ -108,7 +109,7 @@ def plot_coverage(n, shares, claimed=0.95, axes=None, title=""):
         ax.yaxis.set_major_formatter(lambda y, _: f"{y:.0%}")
     axes[0].set_ylabel("intervals that hold the truth")
     axes[0].annotate(f"claimed: {claimed:.0%}", (0.99, claimed), ha="right",
-                     xycoords=("axes fraction", "data"), xytext=(0, 4),
+                     xycoords=("axes fraction", "data"), xytext=(0, 6),
                      textcoords="offset points", fontsize=8)
     axes[-1].legend(loc="lower right")
     return axes

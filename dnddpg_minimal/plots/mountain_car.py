@@ -106,8 +106,8 @@ def plot_climbing(predicted, measured, best, usual, axes=None, title=""):
     axes[1].plot(theta, share, "o-", markersize=5,
                  markerfacecolor="white", color=ONE["color"])
     axes[1].set(ylim=(-4, 104), ylabel="episodes that arrive (%)")
-    axes[1].annotate("no\nmemory", (theta[-1], share[-1]), xytext=(3, 9),
-                     textcoords="offset points", ha="center", fontsize=8.5)
+    axes[1].annotate("no memory", (theta[-1], share[-1]), xytext=(-9, -1),
+                     textcoords="offset points", ha="right", va="center", fontsize=8.5)
     for ax, name in zip(axes, ("closed form", "simulated")):
         ax.set(xscale="log", xlabel="θ  (short memory →)")
         ax.set_title(name, loc="center", fontsize=9)
@@ -176,7 +176,7 @@ def plot_found_or_not(pictures, axes=None, title=""):
     for ax in axes[-1]:
         ax.set_xlabel("position")
     figure = axes[0, 0].figure
-    figure.colorbar(image, ax=axes[:, :2], extend="both")
+    figure.colorbar(image, ax=axes[:, :2], extend="both", label="discounted return")
     bar = figure.colorbar(errors, ax=axes[:, 2], extend="both")
     bar.set_label("← underestimates    overestimates →", fontsize=8)
     return axes
@@ -199,7 +199,7 @@ def plot_bias_and_return(groups, ax=None, title=""):
     for (label, runs), colour in zip(groups.items(), colours):
         for name, of_name in runs.groupby("algorithm", sort=False):
             ax.plot(of_name["bias"], of_name["mean"], MARKERS[name], markersize=7,
-                    markerfacecolor="none", markeredgecolor=colour, markeredgewidth=1.7)
+                    markerfacecolor="none", markeredgecolor=colour, markeredgewidth=1.2)
         ax.plot([], [], "s", markersize=7, color=colour, label=label)
     for name in STYLE:
         ax.plot([], [], MARKERS[name], color="0.3", markerfacecolor="none", label=name)
@@ -208,6 +208,9 @@ def plot_bias_and_return(groups, ax=None, title=""):
     ax.set_xlim(min(low, -20), max(high, 20))
     ax.set_ylim(min(ax.get_ylim()[0], -20) - 5, 110)
     ax.set(title=title, ylabel="return of an episode",
-           xlabel="Q − truth at start states\n← underestimates    overestimates →")
+           xlabel="Q − truth at start states")
+    for text, side in (("← underestimates ", "right"), (" overestimates →", "left")):
+        ax.annotate(text, (0, 0.25), xycoords=("data", "axes fraction"), ha=side,
+                    fontsize=8.5)
     ax.legend(loc="center left", bbox_to_anchor=(1, 0.5))
     return ax

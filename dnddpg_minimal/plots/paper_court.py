@@ -82,7 +82,7 @@ def plot_table_1(schedules, values, limit, axes=None, title=""):
     axes[1].annotate(f"limit {limit}".replace("-", "−"), (limit, 0.97), ha="right",
                      xycoords=("data", "axes fraction"), va="top", xytext=(-5, 0),
                      textcoords="offset points")
-    axes[1].set(xlabel="true value of a state", yticks=[],
+    axes[1].set(xlabel="true value of a state", yticks=[], ylabel="share of states",
                 title="true values, and a limit on y")
     for ax in axes:
         ax.title.set_size(9)

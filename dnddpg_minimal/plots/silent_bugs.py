@@ -97,6 +97,8 @@ def plot_practice(agents, axes=None, title=""):
         few_steps(ax)
     for row in np.reshape(every, (rows, columns)):
         row[0].set_ylabel("return")
+    for ax in every[:len(agents)][-columns:]:  # the lowest of each column
+        ax.set_xlabel("environment steps", fontsize=8.5)
     handles = every[0].get_legend_handles_labels()[0]
     every[0].figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return axes
