@@ -77,7 +77,7 @@ CHOICES = dict(
     ends=("terminated", "none", "any_end"), backend=("numpy", "torch"),
     dtype=("float32", "float64"))
 _ABOVE_0 = math.ulp(0.0)  # the smallest number above 0
-LIMITS = {  # (lowest, highest): fields. Whole numbers where the lowest is an int
+LIMITS = {name: limits for limits, names in {  # lowest (an int: whole numbers), highest
     (0, math.inf): "seed warmup updates_per_step freeze_actors_after",
     (1, math.inf): "critics actors steps episodes max_episode_steps target_every "
                    "evaluate_every yield_every",
@@ -86,7 +86,7 @@ LIMITS = {  # (lowest, highest): fields. Whole numbers where the lowest is an in
     (0.0, 1e9): "sigma",
     (-1e9, 1e9): "y_min",
     (_ABOVE_0, 1.0): "tau noise_decay critic_lr actor_lr",
-}  # fmt: skip
+}.items() for name in names.split()}  # fmt: skip
 
 
 def _nearest(value, choices):
@@ -96,10 +96,15 @@ def _nearest(value, choices):
     return f" Did you mean {lower[near[0]]!r}?" if near else ""
 
 
-def _not_allowed(name, value, choices):
-    """The sentence for a wrong choice, with the nearest correct spelling."""
-    return (f"{name}={value!r} is not allowed: expected one of "
-            f"{', '.join(map(repr, choices))}.{_nearest(value, choices)}")
+def _wrong(name, value, expected):
+    """The ValueError that names a wrong value, and says what was expected."""
+    return ValueError(f"{name}={value!r} is not allowed: expected {expected}")
+
+
+def _no_choice(name, value, choices):
+    """The ValueError for a wrong choice, with the nearest correct spelling."""
+    allowed = ", ".join(map(repr, choices))
+    return _wrong(name, value, f"one of {allowed}.{_nearest(value, choices)}")
 
 
 def _number(name, value, low, high):
@@ -110,8 +115,7 @@ def _number(name, value, low, high):
     words = "a whole number" if kind is Integral else "a number"
     lowest = "above 0" if low == _ABOVE_0 else f"{low:g} or more"
     highest = "" if high == math.inf else f", at most {high:g}"
-    raise ValueError(f"{name}={value!r} is not allowed: expected {words}, "
-                     f"{lowest}{highest}.")
+    raise _wrong(name, value, f"{words}, {lowest}{highest}.")
 
 
 @dataclass(frozen=True)
@@ -164,11 +168,9 @@ class Config:
 
     def __post_init__(self):
         mine = vars(self)  # the fields; written here, since `self.x = 1` is frozen
-        for (low, high), names in LIMITS.items():
-            for name in names.split():
-                may_be_none = getattr(Config, name) is None  # its default
-                if not (may_be_none and mine[name] is None):
-                    mine[name] = _number(name, mine[name], low, high)
+        for name, limits in LIMITS.items():
+            if mine[name] is not None or getattr(Config, name) is not None:  # default
+                mine[name] = _number(name, mine[name], *limits)
         mine.update(self._networks())
         for name, value in PRESETS.get(str(self.task), _SMALL).items():
             if mine[name] is None and (name != "steps" or self.episodes is None):
@@ -177,8 +179,7 @@ class Config:
             mine["buffer_size"] = min(self.steps or MAX_REPLAY, MAX_REPLAY)
         for name, allowed in CHOICES.items():
             if mine[name] not in allowed:
-                raise ValueError(_not_allowed(name, mine[name], allowed))
-            mine[name] = allowed[allowed.index(mine[name])]  # plain text, for to_json
+                raise _no_choice(name, mine[name], allowed)
         self._check_the_rest()
         mine["device"] = str(self.device)
         mine["hidden"] = tuple(int(width) for width in self.hidden)
@@ -194,8 +195,7 @@ class Config:
         elif str(self.algorithm) in ALGORITHMS:
             critics, actors = ALGORITHMS[str(self.algorithm)]
         else:
-            known = *ALGORITHMS, "C3-K2"  # the form of all others
-            raise ValueError(_not_allowed("algorithm", self.algorithm, known))
+            raise _no_choice("algorithm", self.algorithm, (*ALGORITHMS, "C3-K2"))
         if self.critics not in (None, critics) or self.actors not in (None, actors):
             raise ValueError(f"critics={self.critics}, actors={self.actors} contradict "
                              f"algorithm={self.algorithm!r}, which has {critics} and "
@@ -206,31 +206,30 @@ class Config:
 
     def _check_the_rest(self):
         if not isinstance(self.task, str):
-            raise ValueError(f"task={self.task!r}: expected the name of a task.")
+            raise _wrong("task", self.task, "the name of a task.")
         if self.steps is not None and self.episodes is not None:
             raise ValueError(f"steps={self.steps} and episodes={self.episodes}: "
                              "give one of the two; it says when the run ends.")
         hidden = self.hidden if isinstance(self.hidden, list | tuple) else ()
         if not (hidden and all(isinstance(h, Integral) and h >= 1 for h in hidden)):
-            raise ValueError(f"hidden={self.hidden!r} is not allowed: expected widths "
-                             "such as (64, 64), whole numbers of 1 or more.")
+            raise _wrong("hidden", self.hidden, "widths such as (64, 64), whole "
+                         "numbers of 1 or more.")
         try:  # now, as a file will hold them: tuples become lists
             options = json.loads(json.dumps(self.task_options or {}))
             vars(self)["task_options"] = dict(options)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"task_options={self.task_options!r} is not allowed: "
-                             "expected a dict such as {'goal_area': 'window'}, of what "
-                             f"JSON can hold ({error}).") from error
+            raise _wrong("task_options", self.task_options, "a dict such as "
+                         "{'goal_area': 'window'}, of what JSON can hold "
+                         f"({error}).") from error
         if self.actors > self.critics:
-            raise ValueError(f"actors={self.actors} with critics={self.critics}: actor "
-                             "k climbs critic k, so expected actors <= critics.")
+            raise _wrong("actors", self.actors, "actors <= critics, since actor k "
+                         f"climbs critic k; got critics={self.critics}.")
         if self.target_rule == "paired_min" and self.actors != self.critics:
-            raise ValueError("target_rule='paired_min' needs actors = critics; got "
-                             f"actors={self.actors}, critics={self.critics}.")
+            raise _wrong("target_rule", "paired_min", "as many actors as critics; got "
+                         f"actors={self.actors}, critics={self.critics}.")
         devices = "cpu" if self.backend == "numpy" else r"cpu|cuda(:\d+)?"
         if not re.fullmatch(devices, str(self.device)):
-            raise ValueError(f"device={self.device!r} is not allowed: expected 'cpu', "
-                             "or 'cuda' with backend='torch'.")
+            raise _wrong("device", self.device, "'cpu'; 'cuda' with backend='torch'.")
 
     @classmethod
     def paper(cls, task="HalfCheetah-v5", algorithm="DN-DDPG", seed=0):
@@ -242,7 +241,7 @@ class Config:
         has no preset: the paper doesn't speak of it.
         """
         if task not in PRESETS:
-            raise ValueError(_not_allowed("task", task, PRESETS))
+            raise _no_choice("task", task, PRESETS)
         table_1 = dict(actor_lr=1e-4, critic_lr=1e-4, hidden=(400, 300), batch_size=256,
                        tau=0.01, gamma=0.99, target_every=10, episodes=5_000)
         small = dict(episodes=2_000, max_episode_steps=300)
@@ -512,7 +511,7 @@ def choose_actor(q, rule="paired"):
         return q.min(axis=0).argmax(axis=0)
     if rule == "first":
         return np.zeros(q.shape[2], int)
-    raise ValueError(_not_allowed("act_rule", rule, CHOICES["act_rule"]))
+    raise _no_choice("act_rule", rule, CHOICES["act_rule"])
 
 
 def next_value(q_next, rule="max_min", nu=0.1):
@@ -548,7 +547,7 @@ def next_value(q_next, rule="max_min", nu=0.1):
         return lowest[choose_actor(q_next, "paired"), np.arange(size)]
     if rule == "soft":
         return (1 - nu) * lowest.max(axis=0) + nu * lowest.min(axis=0)
-    raise ValueError(_not_allowed("rule", rule, CHOICES["target_rule"]))
+    raise _no_choice("rule", rule, CHOICES["target_rule"])
 
 
 def td_target(reward, terminated, q_next, gamma, rule="max_min", nu=0.1, y_min=None):

@@ -29,7 +29,7 @@ from dnddpg_minimal.dnddpg import (
     MUJOCO_TASKS,
     Config,
     _nearest,
-    _not_allowed,
+    _no_choice,
     make_agent,
 )
 
@@ -82,7 +82,7 @@ def load_study(task=None, algorithm=None, variant="class", what="evaluations",
     if what not in WHAT:
         raise ValueError(f"what={what!r}: expected one of {', '.join(WHAT)}.")
     if rule not in (None, *CHOICES["act_rule"]):
-        raise ValueError(_not_allowed("rule", rule, CHOICES["act_rule"]))
+        raise _no_choice("rule", rule, CHOICES["act_rule"])
     asked = dict(task=task, variant=variant, algorithm=algorithm)
     folder, found = Path(folder or RECORDINGS), []
     for name in _names(folder):
