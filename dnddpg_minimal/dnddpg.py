@@ -472,19 +472,15 @@ def adam(theta, dtheta, m, v, t, lr, beta1=0.9, beta2=0.999, eps=1e-8):
 
     theta, its gradient dtheta, and the moments m and v are (P,). As PyTorch's: moments
     are bias-corrected, eps stands outside the square root. lr is the learning rate;
-    beta1 and beta2, how much of the moments stays. Overwrites dtheta.
+    beta1 and beta2, how much of the moments stays.
     """
     correction = math.sqrt(1 - beta2**t)
     m *= beta1
     m += (1 - beta1) * dtheta
     v *= beta2
     v += (1 - beta2) * dtheta**2
-    # m^ = m / (1 - beta1^t) and v^ = v / (1 - beta2^t); below: lr m^ / (sqrt(v^) + eps)
-    step = np.sqrt(v, out=dtheta)
-    step += eps * correction
-    np.divide(m, step, out=step)
-    step *= lr * correction / (1 - beta1**t)
-    theta -= step
+    # lr m^ / (sqrt(v^) + eps), where m^ = m / (1 - beta1^t) and v^ = v / (1 - beta2^t)
+    theta -= lr * correction / (1 - beta1**t) * (m / (np.sqrt(v) + eps * correction))
     if t % 256 == 0:  # where gradients have died, m fades into numbers so small
         m[np.abs(m) < 1e-25] = 0  # ("denormal") that processors are slow with
 
