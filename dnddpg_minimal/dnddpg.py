@@ -882,6 +882,9 @@ def make_agent(config, obs_dim, action_dim):
 # --- 7. The task ----------------------------------------------------------------------
 
 
+LARGEST = 1e18  # of a number from the task; its square still fits into float32
+
+
 def to_env(action, space):
     """[-1, 1] → the units of the task's action space, (A,) or (B, A).
 
@@ -918,17 +921,13 @@ def make_env(config, render_mode=None):
         elif config.task not in gym.registry:
             why = f"is unknown to Gymnasium.{_nearest(config.task, gym.registry)}"
         raise ValueError(f"{named} {why}") from error
-    for name in ("observation_space", "action_space"):
+    for name, kinds in (("observation_space", "fiub"), ("action_space", "f")):
         space = getattr(env, name)
-        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+        if not (isinstance(space, gym.spaces.Box) and len(space.shape) == 1
+                and space.dtype.kind in kinds):
             raise ValueError(f"{named} has {name} {space}: expected a flat Box of "
-                             "numbers (continuous, one axis).")
-    if not np.issubdtype(env.action_space.dtype, np.floating):
-        raise ValueError(f"{named} has actions of {env.action_space.dtype}: expected "
-                         "floating point numbers.")
-    with np.errstate(over="ignore"):
-        width = env.action_space.high - env.action_space.low
-    if not np.isfinite(width).all():
+                             "numbers (one axis; actions continuous).")
+    if not (np.abs([env.action_space.low, env.action_space.high]) < LARGEST).all():
         raise ValueError(f"{named} has unbounded actions {env.action_space}: expected "
                          "finite bounds, since actors end in tanh.")
     return env
@@ -984,7 +983,6 @@ class Record(NamedTuple):
 KEPT = 64  # simulator states kept for the measurement of bias,
 KEEP_EVERY = 156  # one from so many steps: 64 from the last 10 000
 FIRST_LOSSES = 20  # critic losses kept from the start of the run
-LARGEST = 1e18  # its square still fits into float32
 _TURN = threading.RLock()  # limits of threads are the process's: one at a time
 
 
