@@ -942,15 +942,13 @@ def simulator_state(env):
     """The whole state of env as arrays: (state (S,), MuJoCo's xipos (bodies, 3)).
 
     `xipos` lags one step behind in MuJoCo, and Humanoid's reward reads it, so it must
-    be kept too. Both are empty for a task that shows no state.
+    be kept too. Both are empty for a task whose `state` is no array.
     """
     inner = env.unwrapped
     if not is_mujoco(env):
-        try:
-            state = np.array(getattr(inner, "state", ()), float).ravel()
-        except Exception:  # something else is called `state` there
-            state = np.empty(0)
-        return state, np.empty((0, 3))
+        state = getattr(inner, "state", None)  # something else may be called so there
+        state = state.astype(float) if isinstance(state, np.ndarray) else np.empty(0)
+        return state.ravel(), np.empty((0, 3))
     import mujoco
 
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
