@@ -288,17 +288,19 @@ def write_npz(path, save=np.savez, **arrays):
         part.unlink(missing_ok=True)
 
 
-def read_npz(path):
+def read_npz(path, what="arrays", use=dict):
     """The arrays of the `.npz` file at `path` as a dict. Never unpickles.
 
-    Raises FileNotFoundError if there is none, ValueError if it is damaged or foreign.
+    Or what `use` makes of that dict; `what` is its name in words. FileNotFoundError if
+    there is no file, ValueError if it is damaged or not what `use` needs.
     """
     with open(path, "rb") as file:
         try:
-            return dict(np.load(file, allow_pickle=False))
+            return use(dict(np.load(file, allow_pickle=False)))
         except Exception as error:  # zipfile and NumPy raise a dozen kinds
-            raise ValueError(f"{path} is damaged, or no file of dnddpg_minimal "
-                             f"({type(error).__name__}: {error}).") from error
+            lacks = "it lacks " if isinstance(error, KeyError) else ""
+            raise ValueError(f"{path} is damaged, or holds no {what} that this version "
+                             f"can read: {lacks}{error}.") from error
 
 
 def _array_to_json(array):
@@ -634,12 +636,14 @@ class Agent:
         self.critic_target, self.actor_target = self.cut(self.theta_target)
         self._prepare()
 
-    def __getstate__(self):  # for copy and pickle: layers must be cut anew as views
-        return self.config, self.obs_dim, self.action_dim, self.arrays()
+    def __getstate__(self):  # for files, copy and pickle: layers are cut anew as views
+        return dict(config=self.config.to_json(), obs_dim=self.obs_dim,
+                    action_dim=self.action_dim, **self.arrays())
 
     def __setstate__(self, state):
-        self.__init__(*state[:-1])
-        self.set_arrays(state[-1])
+        config = Config.from_json(str(state["config"]))
+        self.__init__(config, int(state["obs_dim"]), int(state["action_dim"]))
+        self.set_arrays(state)
 
     def act(self, obs):
         """The greedy action at obs, without noise: (O,) → (A,) or (B, O) → (B, A)."""
@@ -723,8 +727,7 @@ class Agent:
 
     def save(self, path):
         """Write weights, slow copies and Adam's moments to one `.npz` at `path`."""
-        write_npz(path, config=self.config.to_json(), obs_dim=self.obs_dim,
-                  action_dim=self.action_dim, **self.arrays())
+        write_npz(path, **self.__getstate__())
 
     @classmethod
     def load(cls, path):
@@ -733,15 +736,8 @@ class Agent:
         `NumpyAgent.load` makes a NumPy agent of it, `TorchAgent.load` a PyTorch agent.
         Raises ValueError if the file holds no agent, or one of another version.
         """
-        content = read_npz(path)
-        try:
-            config = Config.from_json(str(content["config"]))
-            agent = cls(config, int(content["obs_dim"]), int(content["action_dim"]))
-            agent.set_arrays(content)
-        except (KeyError, TypeError, ValueError) as error:
-            lacks = "it lacks " if isinstance(error, KeyError) else ""
-            raise ValueError(f"{path} holds no agent that this version can read: "
-                             f"{lacks}{error}.") from error
+        agent = cls.__new__(cls)
+        read_npz(path, "agent", agent.__setstate__)
         return agent
 
 
@@ -1142,8 +1138,8 @@ class Training:
         small = {name: copy(getattr(self, name)) for name in self.SMALL} | dict(
             noise_scale=self.noise.scale, agent=type(self.agent).__name__,
             streams=streams)
-        arrays = self.agent.arrays()  # an interrupt up to here leaves the old three
-        self._overwritten, self._arrays, self._small = [], arrays, small
+        agent = self.agent.__getstate__()  # an interrupt here leaves the old three
+        self._overwritten, self._agent, self._small = [], agent, small
 
     def _store(self, *transition):
         """Into replay; what it overwrites is noted until the episode's end."""
@@ -1162,30 +1158,22 @@ class Training:
         for row, transition in reversed(self._overwritten):
             for array, old in zip(replay, transition, strict=True):
                 array[row] = old
-        write_npz(path, config=self.config.to_json(), obs_dim=self.agent.obs_dim,
-                  action_dim=self.agent.action_dim, **self._arrays,
-                  small=json.dumps(self._small, default=_array_to_json),
-                  **dict(zip(Batch._fields, replay, strict=True)))
+        write_npz(path, small=json.dumps(self._small, default=_array_to_json),
+                  **self._agent, **dict(zip(Batch._fields, replay, strict=True)))
 
     @classmethod
     def load(cls, path):
         """A Training that goes on where `path` was written. ValueError if damaged."""
-        content = read_npz(path)
-        try:
-            training = cls(Config.from_json(str(content["config"])))
-            training._restore(content)
-        except (KeyError, TypeError, ValueError) as error:
-            lacks = "it lacks " if isinstance(error, KeyError) else ""  # as an agent's
-            raise ValueError(f"{path} holds no training that this version can resume: "
-                             f"{lacks}{error}.") from error
+        training = cls.__new__(cls)
+        read_npz(path, "training", training._restore)
         return training
 
     def _restore(self, content):
+        self.__init__(Config.from_json(str(content["config"])))
         small = json.loads(str(content["small"]), object_hook=_array_from_json)
         mine = type(self.agent).__name__
         if small.get("agent", mine) != mine:
-            raise ValueError(f"its agent is a {small['agent']}, and this Training's a "
-                             f"{mine}")
+            raise ValueError(f"its agent is a {small['agent']}, not a {mine}")
         for name in self.SMALL:
             setattr(self, name, small[name])
         self.records = [Record(*record) for record in self.records]
