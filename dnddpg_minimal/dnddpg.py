@@ -303,19 +303,6 @@ def read_npz(path, what="arrays", use=dict):
                              f"can read: {lacks}{error}.") from error
 
 
-def _array_to_json(array):
-    """An array, which `json` cannot write, as a dict, which it can."""
-    values = array.ravel().tolist()
-    return dict(dtype=array.dtype.name, shape=array.shape, values=values)
-
-
-def _array_from_json(found):
-    """The array that `_array_to_json` wrote; any other dict as it is."""
-    if found.keys() != {"dtype", "shape", "values"}:
-        return found
-    return np.array(found["values"], found["dtype"]).reshape(found["shape"])
-
-
 # --- 3. Replay and exploration noise --------------------------------------------------
 
 
@@ -980,6 +967,12 @@ FIRST_LOSSES = 20  # critic losses kept from the start of the run
 _TURN = threading.RLock()  # limits of threads are the process's: one at a time
 
 
+def _kept(step, state, xipos, obs, action):
+    """A kept state, from arrays or from the lists of a file."""
+    return dict(step=step, state=np.array(state), xipos=np.reshape(xipos, (-1, 3)),
+                obs=np.float32(obs), action=np.float32(action))
+
+
 class Training:
     """One run of a config, as an iterator of `Record`s. It learns; its caller measures.
 
@@ -1122,10 +1115,7 @@ class Training:
 
     def _keep(self, obs, action):
         """Keep the simulator's state before a step that was drawn beforehand."""
-        state, xipos = simulator_state(self.env)
-        self.kept.append(dict(step=self.step, state=state, xipos=xipos,
-                              obs=np.array(obs, np.float32),
-                              action=np.array(action, np.float32)))
+        self.kept.append(_kept(self.step, *simulator_state(self.env), obs, action))
         del self.kept[:-KEPT]
         next_window = (self.step // KEEP_EVERY + 1) * KEEP_EVERY
         self.keep_at = next_window + int(self.streams["keep"].integers(KEEP_EVERY))
@@ -1158,7 +1148,7 @@ class Training:
         for row, transition in reversed(self._overwritten):
             for array, old in zip(replay, transition, strict=True):
                 array[row] = old
-        write_npz(path, small=json.dumps(self._small, default=_array_to_json),
+        write_npz(path, small=json.dumps(self._small, default=np.ndarray.tolist),
                   **self._agent, **dict(zip(Batch._fields, replay, strict=True)))
 
     @classmethod
@@ -1170,13 +1160,15 @@ class Training:
 
     def _restore(self, content):
         self.__init__(Config.from_json(str(content["config"])))
-        small = json.loads(str(content["small"]), object_hook=_array_from_json)
+        small = json.loads(str(content["small"]))  # arrays became lists
         mine = type(self.agent).__name__
         if small.get("agent", mine) != mine:
             raise ValueError(f"its agent is a {small['agent']}, not a {mine}")
         for name in self.SMALL:
             setattr(self, name, small[name])
-        self.records = [Record(*record) for record in self.records]
+        self.records = [Record(*rest, np.array(critic_loss), np.array(actor_loss))
+                        for *rest, critic_loss, actor_loss in self.records]
+        self.kept = [_kept(**one) for one in self.kept]
         self.noise.scale = small["noise_scale"]
         for role, rng in self.streams.items():
             rng.bit_generator.state = small["streams"][role]
