@@ -1034,8 +1034,7 @@ class Training:
         config = self.config
         while not self.finished:
             seed = int(self.streams["environment"].integers(2**31))
-            obs, _ = self.env.reset(seed=seed)
-            obs = self._checked(obs)
+            obs = self._checked(self.env.reset(seed=seed)[0])
             self.noise.reset()
             self._return, self._length, over = 0.0, 0, False
             self._losses = [np.zeros(count, self.agent.dtype)  # sums
@@ -1065,8 +1064,7 @@ class Training:
             to_env(action, self.env.action_space))
         next_obs = self._checked(next_obs, reward)
         over = bool(terminated or truncated)
-        end = {"terminated": bool(terminated), "none": False,
-               "any_end": over}[config.ends]
+        end = dict(terminated=terminated, none=False, any_end=over)[config.ends]
         self._store(obs, action, reward, next_obs, end)
         self._return += float(reward)
         self._length += 1
@@ -1129,14 +1127,13 @@ class Training:
             noise_scale=self.noise.scale, agent=type(self.agent).__name__,
             streams=streams)
         agent = self.agent.__getstate__()  # an interrupt here leaves the old three
-        self._overwritten, self._agent, self._small = [], agent, small
+        self._overwritten, self._agent, self._small = {}, agent, small
 
     def _store(self, *transition):
         """Into replay; what it overwrites is noted until the episode's end."""
         row = self.replay.position
-        if row < self._small["step"]:  # in use when the episode began
-            old = [array[row].copy() for array in self.replay.arrays]
-            self._overwritten.append((row, old))
+        if row < self._small["step"] and row not in self._overwritten:  # an old one
+            self._overwritten[row] = [array[row].copy() for array in self.replay.arrays]
         self.replay.add(*transition)
 
     def save(self, path):
@@ -1145,7 +1142,7 @@ class Training:
         At the end of the run it is the state then, even in the middle of an episode.
         """
         replay = [array[:self._small["step"]].copy() for array in self.replay.arrays]
-        for row, transition in reversed(self._overwritten):
+        for row, transition in self._overwritten.items():
             for array, old in zip(replay, transition, strict=True):
                 array[row] = old
         write_npz(path, small=json.dumps(self._small, default=np.ndarray.tolist),
