@@ -611,12 +611,9 @@ class Agent:
         return state | dict(updates=self.updates, climbs=self.actor_updates)
 
     def set_arrays(self, arrays):
-        """Go on from the `arrays` of either agent. ValueError if shapes differ."""
+        """Go on from the `arrays` of either agent. ValueError if sizes differ."""
         for name in self.STATE:
-            if np.shape(arrays[name]) != (self.size,):
-                raise ValueError(f"{name} has shape {np.shape(arrays[name])}: expected "
-                                 f"({self.size},)")
-            setattr(self, name, self._array(arrays[name]))
+            setattr(self, name, self._array(np.reshape(arrays[name], self.size)))
         self.updates = int(arrays["updates"])
         self.actor_updates = int(arrays.get("climbs", self.updates))  # not in old files
         self.critic, self.actor = self.cut(self.theta)
