@@ -798,14 +798,13 @@ class TorchAgent(Agent):
         return tensor.detach().cpu().numpy().copy()
 
     def _prepare(self):
-        config = self.config
-        parts = zip((self.critic, self.actor), self.cut(self.adam_m),
-                    self.cut(self.adam_v), (self.updates, self.actor_updates),
-                    (config.critic_lr, config.actor_lr), strict=True)
-        self.critic_adam, self.actor_adam = (self._adam(*part) for part in parts)
+        self.critic_adam = self._adam(0, self.updates, self.config.critic_lr)
+        self.actor_adam = self._adam(1, self.actor_updates, self.config.actor_lr)
 
-    def _adam(self, layers, m, v, steps, lr):
-        """PyTorch's Adam on these layers, with our vectors as its moments."""
+    def _adam(self, part, steps, lr):
+        """PyTorch's Adam on critics (part 0) or actors (1), our vectors its moments."""
+        layers = (self.critic, self.actor)[part]
+        m, v = self.cut(self.adam_m)[part], self.cut(self.adam_v)[part]
         optimizer = self.torch.optim.Adam([x.requires_grad_() for x in layers], lr=lr)
         for i, layer in enumerate(layers):
             step = self.torch.tensor(float(steps))
