@@ -873,14 +873,6 @@ def to_env(action, space):
     return np.minimum(np.maximum(middle + half * action, space.low), space.high)
 
 
-def _quiet_mujoco():
-    """Keep MuJoCo's note on 'settotalmass' (Humanoid, harmless) off the screen."""
-    import mujoco
-
-    mujoco.set_mju_user_warning(lambda text: "settotalmass" in str(text)
-                                or warnings.warn(str(text), stacklevel=2))
-
-
 def make_env(config, render_mode=None):
     """Make `config.task`, or refuse it with a ValueError that says why.
 
@@ -890,7 +882,11 @@ def make_env(config, render_mode=None):
     shown = {"render_mode": render_mode} if render_mode else {}
     try:
         if "mujoco" in str(gym.spec(config.task).entry_point):
-            _quiet_mujoco()
+            import mujoco
+
+            # Its warnings as Python's (else it writes a file), less a harmless one
+            mujoco.set_mju_user_warning(lambda text: "settotalmass" in text
+                                        or warnings.warn(text, stacklevel=2))
         env = gym.make(config.task, max_episode_steps=config.max_episode_steps,
                        disable_env_checker=True, **shown, **config.task_options)
     except (gym.error.Error, ImportError, TypeError) as error:
@@ -1159,7 +1155,8 @@ class Training:
             raise ValueError(f"its agent is a {small['agent']}, not a {mine}")
         for name in self.SMALL:
             setattr(self, name, small[name])
-        self.records = [Record(*rest, np.array(critic_loss), np.array(actor_loss))
+        self.records = [Record(*rest, np.array(critic_loss, float),
+                               np.array(actor_loss, float))
                         for *rest, critic_loss, actor_loss in self.records]
         self.kept = [_kept(**one) for one in self.kept]
         self.noise.scale = small["noise_scale"]

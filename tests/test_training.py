@@ -2,6 +2,7 @@
 from a run that was killed and went on.
 """
 
+import json
 import math
 import random
 import re
@@ -22,6 +23,7 @@ from dnddpg_minimal import (
     NumpyAgent,
     Record,
     Training,
+    make_env,
     read_npz,
     stream,
     write_npz,
@@ -746,3 +748,26 @@ def test_all_three_algorithms_run_on_every_task(task):
         training = Training(Config(task, algorithm, steps=12, warmup=8, **SMALL,
                                    yield_every=5))
         assert [*training][-1].step == 12 and training.updates == 4
+
+
+def test_mujocos_warnings_are_pythons_and_leave_no_file(tmp_path, monkeypatch):
+    """By itself MuJoCo writes MUJOCO_LOG.TXT into the folder of whoever trains."""
+    pytest.importorskip("mujoco")
+    monkeypatch.chdir(tmp_path)
+    env = make_env(Config("Hopper-v5"))
+    env.reset(seed=0)
+    env.unwrapped.data.qvel[:] = 1e12
+    with pytest.warns(UserWarning, match="unstable"):
+        env.step(np.zeros(3))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_whose_records_are_of_another_version_is_refused(tmp_path):
+    training, _ = toy_run()
+    training.save(tmp_path / "run.npz")
+    content = read_npz(tmp_path / "run.npz")
+    small = json.loads(str(content["small"]))
+    small["records"][0][-1] = dict(dtype="float64", shape=[1], values=[0.5])
+    np.savez(tmp_path / "old.npz", **content | dict(small=json.dumps(small)))
+    with pytest.raises(ValueError, match="no training that this version can read"):
+        Training.load(tmp_path / "old.npz")
