@@ -80,7 +80,9 @@ def with_palette(png):
     if image.mode == "P":  # it has one
         return png
     smaller = io.BytesIO()
-    image = image.convert("RGB").quantize(
+    white = Image.new("RGBA", image.size, "white")
+    image = Image.alpha_composite(white, image.convert("RGBA")).convert("RGB")
+    image = image.quantize(
         256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
     image.save(smaller, "PNG", optimize=True)
     return base64.b64encode(smaller.getvalue()).decode()

@@ -180,6 +180,7 @@ class Config:
         for name, allowed in CHOICES.items():
             if mine[name] not in allowed:
                 raise _no_choice(name, mine[name], allowed)
+            mine[name] = allowed[allowed.index(mine[name])]  # plain text, for to_json
         self._check_the_rest()
         mine["device"] = str(self.device)
         mine["hidden"] = tuple(int(width) for width in self.hidden)
@@ -229,7 +230,8 @@ class Config:
                          f"actors={self.actors}, critics={self.critics}.")
         devices = "cpu" if self.backend == "numpy" else r"cpu|cuda(:\d+)?"
         if not re.fullmatch(devices, str(self.device)):
-            raise _wrong("device", self.device, "'cpu'; 'cuda' with backend='torch'.")
+            raise _wrong("device", self.device, "'cpu', or 'cuda' with "
+                         "backend='torch'.")
 
     @classmethod
     def paper(cls, task="HalfCheetah-v5", algorithm="DN-DDPG", seed=0):
@@ -288,19 +290,30 @@ def write_npz(path, save=np.savez, **arrays):
         part.unlink(missing_ok=True)
 
 
-def read_npz(path, what="arrays", use=dict):
+def read_npz(path):
     """The arrays of the `.npz` file at `path` as a dict. Never unpickles.
 
-    Or what `use` makes of that dict; `what` is its name in words. FileNotFoundError if
-    there is no file, ValueError if it is damaged or not what `use` needs.
+    Raises FileNotFoundError if there is none, ValueError if it is damaged or foreign.
     """
     with open(path, "rb") as file:
         try:
-            return use(dict(np.load(file, allow_pickle=False)))
+            return dict(np.load(file, allow_pickle=False))
         except Exception as error:  # zipfile and NumPy raise a dozen kinds
-            lacks = "it lacks " if isinstance(error, KeyError) else ""
-            raise ValueError(f"{path} is damaged, or holds no {what} that this version "
-                             f"can read: {lacks}{error}.") from error
+            raise ValueError(f"{path} is damaged, or no file of dnddpg_minimal "
+                             f"({type(error).__name__}: {error}).") from error
+
+
+def _array_to_json(array):
+    """An array, which `json` cannot write, as a dict, which it can."""
+    values = array.ravel().tolist()
+    return dict(dtype=array.dtype.name, shape=array.shape, values=values)
+
+
+def _array_from_json(found):
+    """The array that `_array_to_json` wrote; any other dict as it is."""
+    if found.keys() != {"dtype", "shape", "values"}:
+        return found
+    return np.array(found["values"], found["dtype"]).reshape(found["shape"])
 
 
 # --- 3. Replay and exploration noise --------------------------------------------------
@@ -611,23 +624,24 @@ class Agent:
         return state | dict(updates=self.updates, climbs=self.actor_updates)
 
     def set_arrays(self, arrays):
-        """Go on from the `arrays` of either agent. ValueError if sizes differ."""
+        """Go on from the `arrays` of either agent. ValueError if shapes differ."""
         for name in self.STATE:
-            setattr(self, name, self._array(np.reshape(arrays[name], self.size)))
+            if np.shape(arrays[name]) != (self.size,):
+                raise ValueError(f"{name} has shape {np.shape(arrays[name])}: expected "
+                                 f"({self.size},)")
+            setattr(self, name, self._array(arrays[name]))
         self.updates = int(arrays["updates"])
         self.actor_updates = int(arrays.get("climbs", self.updates))  # not in old files
         self.critic, self.actor = self.cut(self.theta)
         self.critic_target, self.actor_target = self.cut(self.theta_target)
         self._prepare()
 
-    def __getstate__(self):  # for files, copy and pickle: layers are cut anew as views
-        return dict(config=self.config.to_json(), obs_dim=self.obs_dim,
-                    action_dim=self.action_dim, **self.arrays())
+    def __getstate__(self):  # for copy and pickle: layers must be cut anew as views
+        return self.config, self.obs_dim, self.action_dim, self.arrays()
 
     def __setstate__(self, state):
-        config = Config.from_json(str(state["config"]))
-        self.__init__(config, int(state["obs_dim"]), int(state["action_dim"]))
-        self.set_arrays(state)
+        self.__init__(*state[:-1])
+        self.set_arrays(state[-1])
 
     def act(self, obs):
         """The greedy action at obs, without noise: (O,) → (A,) or (B, O) → (B, A)."""
@@ -711,7 +725,8 @@ class Agent:
 
     def save(self, path):
         """Write weights, slow copies and Adam's moments to one `.npz` at `path`."""
-        write_npz(path, **self.__getstate__())
+        write_npz(path, config=self.config.to_json(), obs_dim=self.obs_dim,
+                  action_dim=self.action_dim, **self.arrays())
 
     @classmethod
     def load(cls, path):
@@ -720,8 +735,15 @@ class Agent:
         `NumpyAgent.load` makes a NumPy agent of it, `TorchAgent.load` a PyTorch agent.
         Raises ValueError if the file holds no agent, or one of another version.
         """
-        agent = cls.__new__(cls)
-        read_npz(path, "agent", agent.__setstate__)
+        content = read_npz(path)
+        try:
+            config = Config.from_json(str(content["config"]))
+            agent = cls(config, int(content["obs_dim"]), int(content["action_dim"]))
+            agent.set_arrays(content)
+        except (KeyError, TypeError, ValueError) as error:
+            lacks = "it lacks " if isinstance(error, KeyError) else ""
+            raise ValueError(f"{path} holds no agent that this version can read: "
+                             f"{lacks}{error}.") from error
         return agent
 
 
@@ -861,9 +883,6 @@ def make_agent(config, obs_dim, action_dim):
 # --- 7. The task ----------------------------------------------------------------------
 
 
-LARGEST = 1e18  # of a number from the task; its square still fits into float32
-
-
 def to_env(action, space):
     """[-1, 1] → the units of the task's action space, (A,) or (B, A).
 
@@ -896,13 +915,17 @@ def make_env(config, render_mode=None):
         elif config.task not in gym.registry:
             why = f"is unknown to Gymnasium.{_nearest(config.task, gym.registry)}"
         raise ValueError(f"{named} {why}") from error
-    for name, kinds in (("observation_space", "fiub"), ("action_space", "f")):
+    for name in ("observation_space", "action_space"):
         space = getattr(env, name)
-        if not (isinstance(space, gym.spaces.Box) and len(space.shape) == 1
-                and space.dtype.kind in kinds):
+        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
             raise ValueError(f"{named} has {name} {space}: expected a flat Box of "
-                             "numbers (one axis; actions continuous).")
-    if not (np.abs([env.action_space.low, env.action_space.high]) < LARGEST).all():
+                             "numbers (continuous, one axis).")
+    if not np.issubdtype(env.action_space.dtype, np.floating):
+        raise ValueError(f"{named} has actions of {env.action_space.dtype}: expected "
+                         "floating point numbers.")
+    with np.errstate(over="ignore"):
+        width = env.action_space.high - env.action_space.low
+    if not np.isfinite(width).all():
         raise ValueError(f"{named} has unbounded actions {env.action_space}: expected "
                          "finite bounds, since actors end in tanh.")
     return env
@@ -917,13 +940,15 @@ def simulator_state(env):
     """The whole state of env as arrays: (state (S,), MuJoCo's xipos (bodies, 3)).
 
     `xipos` lags one step behind in MuJoCo, and Humanoid's reward reads it, so it must
-    be kept too. Both are empty for a task whose `state` is no array.
+    be kept too. Both are empty for a task that shows no state.
     """
     inner = env.unwrapped
     if not is_mujoco(env):
-        state = getattr(inner, "state", None)  # something else may be called so there
-        state = state.astype(float) if isinstance(state, np.ndarray) else np.empty(0)
-        return state.ravel(), np.empty((0, 3))
+        try:
+            state = np.array(getattr(inner, "state", ()), float).ravel()
+        except Exception:  # something else is called `state` there
+            state = np.empty(0)
+        return state, np.empty((0, 3))
     import mujoco
 
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -956,13 +981,8 @@ class Record(NamedTuple):
 KEPT = 64  # simulator states kept for the measurement of bias,
 KEEP_EVERY = 156  # one from so many steps: 64 from the last 10 000
 FIRST_LOSSES = 20  # critic losses kept from the start of the run
+LARGEST = 1e18  # its square still fits into float32
 _TURN = threading.RLock()  # limits of threads are the process's: one at a time
-
-
-def _kept(step, state, xipos, obs, action):
-    """A kept state, from arrays or from the lists of a file."""
-    return dict(step=step, state=np.array(state), xipos=np.reshape(xipos, (-1, 3)),
-                obs=np.float32(obs), action=np.float32(action))
 
 
 class Training:
@@ -1026,7 +1046,8 @@ class Training:
         config = self.config
         while not self.finished:
             seed = int(self.streams["environment"].integers(2**31))
-            obs = self._checked(self.env.reset(seed=seed)[0])
+            obs, _ = self.env.reset(seed=seed)
+            obs = self._checked(obs)
             self.noise.reset()
             self._return, self._length, over = 0.0, 0, False
             self._losses = [np.zeros(count, self.agent.dtype)  # sums
@@ -1056,7 +1077,8 @@ class Training:
             to_env(action, self.env.action_space))
         next_obs = self._checked(next_obs, reward)
         over = bool(terminated or truncated)
-        end = dict(terminated=terminated, none=False, any_end=over)[config.ends]
+        end = {"terminated": bool(terminated), "none": False,
+               "any_end": over}[config.ends]
         self._store(obs, action, reward, next_obs, end)
         self._return += float(reward)
         self._length += 1
@@ -1105,7 +1127,10 @@ class Training:
 
     def _keep(self, obs, action):
         """Keep the simulator's state before a step that was drawn beforehand."""
-        self.kept.append(_kept(self.step, *simulator_state(self.env), obs, action))
+        state, xipos = simulator_state(self.env)
+        self.kept.append(dict(step=self.step, state=state, xipos=xipos,
+                              obs=np.array(obs, np.float32),
+                              action=np.array(action, np.float32)))
         del self.kept[:-KEPT]
         next_window = (self.step // KEEP_EVERY + 1) * KEEP_EVERY
         self.keep_at = next_window + int(self.streams["keep"].integers(KEEP_EVERY))
@@ -1118,14 +1143,15 @@ class Training:
         small = {name: copy(getattr(self, name)) for name in self.SMALL} | dict(
             noise_scale=self.noise.scale, agent=type(self.agent).__name__,
             streams=streams)
-        agent = self.agent.__getstate__()  # an interrupt here leaves the old three
-        self._overwritten, self._agent, self._small = {}, agent, small
+        arrays = self.agent.arrays()  # an interrupt up to here leaves the old three
+        self._overwritten, self._arrays, self._small = [], arrays, small
 
     def _store(self, *transition):
         """Into replay; what it overwrites is noted until the episode's end."""
         row = self.replay.position
-        if row < self._small["step"] and row not in self._overwritten:  # an old one
-            self._overwritten[row] = [array[row].copy() for array in self.replay.arrays]
+        if row < self._small["step"]:  # in use when the episode began
+            old = [array[row].copy() for array in self.replay.arrays]
+            self._overwritten.append((row, old))
         self.replay.add(*transition)
 
     def save(self, path):
@@ -1134,31 +1160,36 @@ class Training:
         At the end of the run it is the state then, even in the middle of an episode.
         """
         replay = [array[:self._small["step"]].copy() for array in self.replay.arrays]
-        for row, transition in self._overwritten.items():
+        for row, transition in reversed(self._overwritten):
             for array, old in zip(replay, transition, strict=True):
                 array[row] = old
-        write_npz(path, small=json.dumps(self._small, default=np.ndarray.tolist),
-                  **self._agent, **dict(zip(Batch._fields, replay, strict=True)))
+        write_npz(path, config=self.config.to_json(), obs_dim=self.agent.obs_dim,
+                  action_dim=self.agent.action_dim, **self._arrays,
+                  small=json.dumps(self._small, default=_array_to_json),
+                  **dict(zip(Batch._fields, replay, strict=True)))
 
     @classmethod
     def load(cls, path):
         """A Training that goes on where `path` was written. ValueError if damaged."""
-        training = cls.__new__(cls)
-        read_npz(path, "training", training._restore)
+        content = read_npz(path)
+        try:
+            training = cls(Config.from_json(str(content["config"])))
+            training._restore(content)
+        except (KeyError, TypeError, ValueError) as error:
+            lacks = "it lacks " if isinstance(error, KeyError) else ""  # as an agent's
+            raise ValueError(f"{path} holds no training that this version can resume: "
+                             f"{lacks}{error}.") from error
         return training
 
     def _restore(self, content):
-        self.__init__(Config.from_json(str(content["config"])))
-        small = json.loads(str(content["small"]))  # arrays became lists
+        small = json.loads(str(content["small"]), object_hook=_array_from_json)
         mine = type(self.agent).__name__
         if small.get("agent", mine) != mine:
-            raise ValueError(f"its agent is a {small['agent']}, not a {mine}")
+            raise ValueError(f"its agent is a {small['agent']}, and this Training's a "
+                             f"{mine}")
         for name in self.SMALL:
             setattr(self, name, small[name])
-        self.records = [Record(*rest, np.array(critic_loss, float),
-                               np.array(actor_loss, float))
-                        for *rest, critic_loss, actor_loss in self.records]
-        self.kept = [_kept(**one) for one in self.kept]
+        self.records = [Record(*record) for record in self.records]
         self.noise.scale = small["noise_scale"]
         for role, rng in self.streams.items():
             rng.bit_generator.state = small["streams"][role]

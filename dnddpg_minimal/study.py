@@ -104,7 +104,7 @@ class Run(NamedTuple):
         return f"{config.task}/{self.variant}/{config.algorithm}-{config.seed}"
 
     @property
-    def training(self):
+    def trainer(self):
         """The class that trains it: Training, TD3Training, or a faulty one."""
         from dnddpg_minimal.bugs import BUGS
         from dnddpg_minimal.td3 import TD3Training
@@ -462,7 +462,7 @@ class Checkpoint:
 
     def load(self):
         """Training and Notes as they were saved; new ones if there are none of use."""
-        kind = self.run.training
+        kind = self.run.trainer
         with suppress(FileNotFoundError, ValueError, KeyError):
             training = kind.load(self.training)
             return training, Notes.load(self.notes, training.step)

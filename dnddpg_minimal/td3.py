@@ -24,6 +24,7 @@ class TD3Agent(NumpyAgent):
 
     def q_next(self, next_obs):
         """Slow critics near the slow actors' actions, Eq. (12.5): (C, K, B)."""
+        # No stream of dnddpg's, but fixed by (seed, update): nothing needs to be saved
         rng = np.random.default_rng([self.config.seed, self.updates])
         actions = self.actions(next_obs, slow=True)  # (K, B, A)
         noise = rng.normal(0, self.sigma, actions.shape)
@@ -38,6 +39,14 @@ class TD3Agent(NumpyAgent):
 
 
 class TD3Training(Training):
-    """Trains `TD3Agent`."""
+    """Trains `TD3Agent`. ValueError for another algorithm, backend or target_every."""
 
     agent_class = TD3Agent
+
+    def __init__(self, config):
+        expected = ("DCN-DDPG", self.agent_class.every, "numpy")
+        if (config.algorithm, config.target_every, config.backend) != expected:
+            raise ValueError("TD3 is DCN-DDPG in NumPy, with target_every="
+                             f"{expected[1]}; got {config.algorithm!r}, "
+                             f"{config.target_every}, backend={config.backend!r}.")
+        super().__init__(config)

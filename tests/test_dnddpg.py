@@ -549,6 +549,7 @@ def test_without_a_time_limit_given_the_tasks_own_holds():
     ("CartPole-v1", {}, "action_space Discrete.*continuous"),
     ("FrozenLake-v1", {}, "Discrete"),
     (toys.TASK, toys.UNBOUNDED, "unbounded"),
+    (toys.TASK, {"high": [math.inf]}, "unbounded"),
     (toys.TASK, {"low": [-3e38], "high": [3e38]}, "unbounded"),  # their width is inf
     ("dnddpg_minimal:ArmEasy-v0", {}, "names a module: import it first"),
     (toys.TASK, {"obs_shape": (2, 2)}, "observation_space.*flat"),
