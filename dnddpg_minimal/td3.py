@@ -24,7 +24,7 @@ class TD3Agent(NumpyAgent):
 
     def q_next(self, next_obs):
         """Slow critics near the slow actors' actions, Eq. (12.5): (C, K, B)."""
-        # No stream of dnddpg's, but fixed by (seed, update): nothing needs to be saved
+        # Fixed by (seed, update): nothing to save, and who measures draws nothing
         rng = np.random.default_rng([self.config.seed, self.updates])
         actions = self.actions(next_obs, slow=True)  # (K, B, A)
         noise = rng.normal(0, self.sigma, actions.shape)
