@@ -137,7 +137,7 @@ def plot_mean_planes(planes, limit, axes=None, title=""):
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for r, (name, pictures) in enumerate(planes.items()):
         for ax, (step, picture) in zip(axes[r], pictures.items()):
-            # Few shades, a small file; none is white, so that the sign is always seen.
+            # Few shades, and none is white, so that the sign is always seen.
             shades = (np.floor(picture["error"] / limit * 5) + 0.5) / 5 * limit
             image = draw_map(ax, picture, shades, ERRORS, -limit, limit)
             note_mean(ax, picture["error"])
