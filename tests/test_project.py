@@ -54,9 +54,10 @@ def test_the_readme_gives_two_complete_commands_of_one_line_each():
         assert command.count("\n") == 1
         assert command.startswith("python3 -m venv .venv && ")
         assert "pip install -r requirements.txt" in command
-    assert read.split("&& ")[-1].split()[-1] == "notebooks/00_start_here.ipynb"
-    # Else JupyterLab sees notebooks/ only: no films, no links to the exercises
-    assert "-m jupyterlab --ServerApp.root_dir=. " in read
+    # A file instead would make notebooks/ the root (no films, no links to exercises),
+    # and the printed address, for a browser elsewhere, would not open it
+    assert read.endswith(" -m jupyterlab --LabApp.default_url=/lab/tree/notebooks/"
+                         "00_start_here.ipynb\n")
     assert "pytest --nbval" in check
 
 

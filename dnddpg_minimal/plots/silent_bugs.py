@@ -144,8 +144,8 @@ def plot_questions(groups, axes=None, title=""):
 def plot_decays(curves, limits, ax=None, title=""):
     """How fast an error that all states share dies, for several update rules.
 
-    curves: a dict from a label to (update (M,), error (M,)), logarithmic; limits: the
-    same labels to the error that is predicted (M,), or None.
+    curves: a dict from a label to (update (M,), error (M,)); limits: the same labels
+    to the error that is predicted (M,), or None.
     """
     if ax is None:
         _, ax = plt.subplots(figsize=(6, 2.7), layout="constrained")
@@ -153,6 +153,8 @@ def plot_decays(curves, limits, ax=None, title=""):
         ax.plot(update, error, label=label, **style)
         if limits.get(label) is not None:
             ax.plot(update, limits[label], color="black", linestyle=":", linewidth=1)
+    if limits:
+        ax.plot([], [], color="black", linestyle=":", linewidth=1, label="formula")
     ax.set(title=title, xlabel="updates", ylabel="error / first error", ylim=0)
     thousands(ax)
     ax.legend()
