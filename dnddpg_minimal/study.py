@@ -184,8 +184,8 @@ def _class():
     runs += _many(10, hard, ddpg, "hidden=184-184", hidden=(184, 184))
     runs += _many(5, hopper, ddpg, "hidden=184-184", hidden=(184, 184))
     runs += _many(5, walker, ddpg, "hidden=186-186", hidden=(186, 186))
-    runs += _many(10, (*pendulum, *hard, *cheetah, *hopper), dcn, "updates_per_step=2",
-                  updates_per_step=2)
+    runs += _many(10, (*pendulum, *hard, *cheetah, *hopper, *walker), dcn,
+                  "updates_per_step=2", updates_per_step=2)
     # The rest of TD3: smoothing and delay
     runs += _many(10, (*cheetah, *hopper, *walker), dcn, "td3", target_every=2)
     runs += _many(10, pendulum, ALGORITHMS, "frozen", freeze_actors_after=20_000)
