@@ -186,6 +186,9 @@ def _class():
     runs += _many(5, walker, ddpg, "hidden=186-186", hidden=(186, 186))
     runs += _many(10, (*pendulum, *hard, *cheetah, *hopper, *walker), dcn,
                   "updates_per_step=2", updates_per_step=2)
+    # The second actor in half: it acts, but is not in y; or the other way round
+    for name, value in (("target_rule", "single"), ("act_rule", "first")):
+        runs += _many(10, (*hard, *hopper), dn, f"{name}={value}", **{name: value})
     # The rest of TD3: smoothing and delay
     runs += _many(10, (*cheetah, *hopper, *walker), dcn, "td3", target_every=2)
     runs += _many(10, pendulum, ALGORITHMS, "frozen", freeze_actors_after=20_000)

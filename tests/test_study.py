@@ -134,6 +134,9 @@ def test_the_class_budget_is_the_issues_list():
         assert count(f"{task}/td3/DCN-DDPG-") == 10
     for task in ("Pendulum-v1", "ArmHard-v0", *bodies):
         assert count(f"{task}/updates_per_step=2/DCN-DDPG-") == 10
+    for task in ("ArmHard-v0", "Hopper-v5"):
+        assert count(f"{task}/target_rule=single/DN-DDPG-") == 10
+        assert count(f"{task}/act_rule=first/DN-DDPG-") == 10
 
 
 def test_a_control_has_as_many_weights_as_the_agent_it_stands_for():
