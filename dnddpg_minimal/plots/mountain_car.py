@@ -176,7 +176,8 @@ def plot_found_or_not(pictures, axes=None, title=""):
     for ax in axes[-1]:
         ax.set_xlabel("position")
     figure = axes[0, 0].figure
-    figure.colorbar(image, ax=axes[:, :2], extend="both", label="discounted return")
+    bar = figure.colorbar(image, ax=axes[:, :2], extend="both")
+    bar.set_label("discounted return", labelpad=-48)  # at its left
     bar = figure.colorbar(errors, ax=axes[:, 2], extend="both")
     bar.set_label("← underestimates    overestimates →", fontsize=8)
     return axes
@@ -193,7 +194,7 @@ def plot_bias_and_return(groups, ax=None, title=""):
     if ax is None:
         _, ax = plt.subplots(figsize=(7, 3.2), layout="constrained")
     ax.axvline(0, **TRUTH)
-    colours = ("#000000", "#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#D55E00")
+    colours = ("#0072B2", "#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#D55E00")
     if len(groups) > len(colours):
         raise ValueError(f"{len(groups)} groups: expected {len(colours)} at the most.")
     for (label, runs), colour in zip(groups.items(), colours):

@@ -76,7 +76,8 @@ def plot_table_1(schedules, values, limit, axes=None, title=""):
                 ylim=(0, 1.04), title="slow copies after a jump")
     axes[0].xaxis.set_major_locator(plt.MultipleLocator(1_000))
     thousands(axes[0])
-    axes[0].legend(loc="center right", bbox_to_anchor=(1, 0.42), fontsize=8)
+    axes[0].legend(loc="center right", bbox_to_anchor=(1.03, 0.42), fontsize=8,
+                   handlelength=1.5)
     axes[1].hist(values, 40, histtype="stepfilled", color=TWO["color"], alpha=0.7)
     axes[1].axvline(limit, **WRONG)
     axes[1].annotate(f"limit {limit}".replace("-", "−"), (limit, 0.97), ha="right",
@@ -146,7 +147,7 @@ def plot_consequences(found, expected=None, axes=None, title=""):
     rows = list(next(iter(found.values())))
     if axes is None:
         figure, axes = plt.subplots(1, len(found), sharey=True, layout="constrained",
-                                    figsize=(6.9, 0.9 + 0.21 * len(rows)))
+                                    figsize=(7.4, 0.9 + 0.21 * len(rows)))
         figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     for ax, (quantity, readings) in zip(axes, found.items()):
         ax.axvline(0, **TRUTH)
@@ -168,6 +169,7 @@ def plot_consequences(found, expected=None, axes=None, title=""):
         ax.set_xticks([-far, -10, -5, 0, 5, 10, far])
         ax.xaxis.set_major_formatter(lambda x, _: f"{x:.0f}".replace("-", "−"))
         ax.minorticks_off()
+        ax.tick_params(axis="x", labelsize=8)
         ax.set(xlim=(-1.6 * reach, 1.6 * reach), xlabel=f"difference in {quantity}")
     axes[0].set_yticks(range(len(rows)), rows, fontsize=8)
     axes[0].set_ylim(len(rows) - 0.5, -0.5)
