@@ -8,7 +8,6 @@ stream and exit code 2, never a traceback.
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import json
 import math
 import os
@@ -228,13 +227,13 @@ def main(argv: list[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else list(argv)
     try:
         check_resume(argv)
-        if argv and argv[0] in elsewhere():
+        if argv and argv[0] in ELSEWHERE:
             module = importlib.import_module(f"dnddpg_minimal.{argv[0]}")
             return module.main(argv[1:])
         app = tyro.extras.SubcommandApp()
         app.command(train)
         app.command(watch)
-        for name, text in elsewhere().items():
+        for name, text in ELSEWHERE.items():
             app.command(lambda: 0, name=name, help=text)
         return app.cli(
             args=argv,
@@ -251,12 +250,6 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return INTERRUPTED
-
-
-def elsewhere():
-    """The commands whose module exists, and what they do."""
-    return {name: text for name, text in ELSEWHERE.items()
-            if importlib.util.find_spec(f"dnddpg_minimal.{name}")}
 
 
 def check_resume(argv):
@@ -332,4 +325,6 @@ def in_words(error):
 
 
 if __name__ == "__main__":
+    for stream in (sys.stdout, sys.stderr):  # a file on Windows may know no γ
+        stream.reconfigure(errors="backslashreplace")
     raise SystemExit(main())

@@ -20,18 +20,19 @@ import importlib.util
 import math
 import os
 import platform
-import statistics
 import subprocess
 import sys
 import time
 from datetime import date
 from functools import partial
 from importlib.metadata import version
+from statistics import median
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from .dnddpg import ALGORITHMS, Batch, Config, NumpyAgent, Training, make_env
+from .study import processor
 
 # task, hidden layers, batch size, steps in one turn
 SIZES = [
@@ -301,11 +302,6 @@ def alternate(runs, rounds):
     return seconds
 
 
-def median(values):
-    """The median of a list of values."""
-    return statistics.median(values)
-
-
 def spread(values, form):
     """The lowest and the highest of values, each written by the format `form`."""
     return f"{form.format(min(values))} to {form.format(max(values))}"
@@ -337,18 +333,6 @@ def machine():
         if importlib.util.find_spec(name.replace("-", "_")):
             programs.append(f"{name} {version(name)}")
     return f"{date.today()}, {processor()}, one thread: {', '.join(programs)}"
-
-
-def processor():
-    """The processor's name, as far as the system tells it."""
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            for line in file:
-                if line.startswith("model name"):
-                    return line.partition(":")[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
 
 
 def main(argv=None) -> int:

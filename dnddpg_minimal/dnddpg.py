@@ -180,10 +180,9 @@ class Config:
         for name, allowed in CHOICES.items():
             if mine[name] not in allowed:
                 raise _no_choice(name, mine[name], allowed)
-            mine[name] = allowed[allowed.index(mine[name])]  # plain text, for to_json
         self._check_the_rest()
         mine["device"] = str(self.device)
-        mine["hidden"] = tuple(int(width) for width in self.hidden)
+        mine["hidden"] = tuple(_number("hidden", n, 1, math.inf) for n in self.hidden)
 
     def _networks(self):
         """C, K and the algorithm's name, from whichever of them were given."""
@@ -211,10 +210,8 @@ class Config:
         if self.steps is not None and self.episodes is not None:
             raise ValueError(f"steps={self.steps} and episodes={self.episodes}: "
                              "give one of the two; it says when the run ends.")
-        hidden = self.hidden if isinstance(self.hidden, list | tuple) else ()
-        if not (hidden and all(isinstance(h, Integral) and h >= 1 for h in hidden)):
-            raise _wrong("hidden", self.hidden, "widths such as (64, 64), whole "
-                         "numbers of 1 or more.")
+        if not (isinstance(self.hidden, list | tuple) and self.hidden):
+            raise _wrong("hidden", self.hidden, "widths such as (64, 64).")
         try:  # now, as a file will hold them: tuples become lists
             options = json.loads(json.dumps(self.task_options or {}))
             vars(self)["task_options"] = dict(options)
@@ -279,7 +276,7 @@ def write_npz(path, save=np.savez, **arrays):
     The file is written under another name, and takes its own name when complete.
     `save=np.savez_compressed` makes it smaller and slower.
     """
-    part = Path(f"{path}.{os.getpid()}.part")
+    part = Path(f"{path}.{os.getpid()}-{threading.get_ident()}.part")
     try:
         with open(part, "wb") as file:
             save(file, **arrays)
@@ -305,8 +302,7 @@ def read_npz(path):
 
 def _array_to_json(array):
     """An array, which `json` cannot write, as a dict, which it can."""
-    values = array.ravel().tolist()
-    return dict(dtype=array.dtype.name, shape=array.shape, values=values)
+    return dict(dtype=array.dtype.name, shape=array.shape, values=array.tolist())
 
 
 def _array_from_json(found):
@@ -882,6 +878,8 @@ def make_agent(config, obs_dim, action_dim):
 
 # --- 7. The task ----------------------------------------------------------------------
 
+LARGEST = 1e18  # of what a task may hand out: its square still fits into float32
+
 
 def to_env(action, space):
     """[-1, 1] → the units of the task's action space, (A,) or (B, A).
@@ -923,12 +921,12 @@ def make_env(config, render_mode=None):
     if not np.issubdtype(env.action_space.dtype, np.floating):
         raise ValueError(f"{named} has actions of {env.action_space.dtype}: expected "
                          "floating point numbers.")
-    with np.errstate(over="ignore"):
-        width = env.action_space.high - env.action_space.low
-    if not np.isfinite(width).all():
+    if not (np.abs([env.action_space.low, env.action_space.high]) < LARGEST).all():
         raise ValueError(f"{named} has unbounded actions {env.action_space}: expected "
                          "finite bounds, since actors end in tanh.")
-    return env
+    if config.task in PRESETS:  # recorded with actions of more digits than the space's
+        return env
+    return gym.wrappers.TransformAction(env, env.action_space.dtype.type, None)
 
 
 def is_mujoco(env):
@@ -981,7 +979,6 @@ class Record(NamedTuple):
 KEPT = 64  # simulator states kept for the measurement of bias,
 KEEP_EVERY = 156  # one from so many steps: 64 from the last 10 000
 FIRST_LOSSES = 20  # critic losses kept from the start of the run
-LARGEST = 1e18  # its square still fits into float32
 _TURN = threading.RLock()  # limits of threads are the process's: one at a time
 
 
@@ -998,7 +995,7 @@ class Training:
     """
 
     # What a file holds beside weights, replay and random streams
-    SMALL = ("step", "episode", "keep_at", "records", "kept", "first_losses")
+    SMALL = ("step", "episode", "keep_at", "kept", "first_losses")
     agent_class = staticmethod(make_agent)
 
     def __init__(self, config):
@@ -1006,6 +1003,9 @@ class Training:
         (obs_dim,), (action_dim,) = (self.env.observation_space.shape,
                                      self.env.action_space.shape)
         self.agent = self.agent_class(config, obs_dim, action_dim)
+        if config.backend == "torch" and isinstance(self.agent, NumpyAgent):
+            raise _wrong("backend", "torch",
+                         f"'numpy' for a {type(self.agent).__name__}.")
         self.streams = {role: stream(config.seed, role) for role in
                         ("replay", "noise", "warmup", "environment", "keep")}
         self.replay = ReplayBuffer(config.buffer_size, obs_dim, action_dim,
@@ -1034,13 +1034,12 @@ class Training:
 
     def __next__(self) -> Record:
         with _TURN, self._threads.limit(limits=1):  # one run, one thread
-            record = next(self._loop, None)
-        if record is None and not self._ended:
-            raise RuntimeError(f"This run broke off at step {self.step}: save(path), "
-                               "then Training.load(path) goes on.")
-        if record is None:
+            for record in self._loop:
+                return record
+        if self._ended:
             raise StopIteration
-        return record
+        raise RuntimeError(f"This run broke off at step {self.step}: save(path), "
+                           "then Training.load(path) goes on.")
 
     def _run(self):
         config = self.config
@@ -1141,8 +1140,8 @@ class Training:
     def _remember(self):
         streams = {role: rng.bit_generator.state for role, rng in self.streams.items()}
         small = {name: copy(getattr(self, name)) for name in self.SMALL} | dict(
-            noise_scale=self.noise.scale, agent=type(self.agent).__name__,
-            streams=streams)
+            noise_scale=self.noise.scale, records=len(self.records), streams=streams,
+            kinds=[type(self).__name__, type(self.agent).__name__])
         arrays = self.agent.arrays()  # an interrupt up to here leaves the old three
         self._overwritten, self._arrays, self._small = [], arrays, small
 
@@ -1163,9 +1162,10 @@ class Training:
         for row, transition in reversed(self._overwritten):
             for array, old in zip(replay, transition, strict=True):
                 array[row] = old
+        small = self._small | {"records": self.records[:self._small["records"]]}
         write_npz(path, config=self.config.to_json(), obs_dim=self.agent.obs_dim,
                   action_dim=self.agent.action_dim, **self._arrays,
-                  small=json.dumps(self._small, default=_array_to_json),
+                  small=json.dumps(small, default=_array_to_json),
                   **dict(zip(Batch._fields, replay, strict=True)))
 
     @classmethod
@@ -1183,13 +1183,13 @@ class Training:
 
     def _restore(self, content):
         small = json.loads(str(content["small"]), object_hook=_array_from_json)
-        mine = type(self.agent).__name__
-        if small.get("agent", mine) != mine:
-            raise ValueError(f"its agent is a {small['agent']}, and this Training's a "
-                             f"{mine}")
+        mine = [type(self).__name__, type(self.agent).__name__]
+        if small["kinds"] != mine:
+            raise ValueError(f"it is of {' and '.join(small['kinds'])}, and this is "
+                             f"{' and '.join(mine)}")
         for name in self.SMALL:
             setattr(self, name, small[name])
-        self.records = [Record(*record) for record in self.records]
+        self.records = [Record(*record) for record in small["records"]]
         self.noise.scale = small["noise_scale"]
         for role, rng in self.streams.items():
             rng.bit_generator.state = small["streams"][role]

@@ -420,12 +420,19 @@ def visits(task, replay):
 
 
 def default_scratch():
-    """Where checkpoints lie: the user's cache folder, never the work tree."""
-    home = Path.home()
-    places = {"win32": os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local",
-              "darwin": home / "Library" / "Caches"}
-    usual = os.environ.get("XDG_CACHE_HOME") or home / ".cache"
-    return Path(places.get(sys.platform, usual)) / "dnddpg_minimal"
+    """Where checkpoints lie: the user's cache folder, never the work tree.
+
+    OSError if this user has none.
+    """
+    name, below_home = {"win32": ("LOCALAPPDATA", "AppData/Local"),
+                        "darwin": ("", "Library/Caches")}.get(
+                            sys.platform, ("XDG_CACHE_HOME", ".cache"))
+    try:
+        folder = os.environ.get(name) or Path.home() / below_home
+    except RuntimeError as error:  # no home either
+        raise OSError(f"no folder for checkpoints ({error}): name one by "
+                      "--scratch FOLDER") from error
+    return Path(folder) / "dnddpg_minimal"
 
 
 def writable(folder, option):

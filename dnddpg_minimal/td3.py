@@ -26,11 +26,12 @@ class TD3Agent(NumpyAgent):
         """Slow critics near the slow actors' actions, Eq. (12.5): (C, K, B)."""
         # Fixed by (seed, update): nothing to save, and who measures draws nothing
         rng = np.random.default_rng([self.config.seed, self.updates])
-        actions = self.actions(next_obs, slow=True)  # (K, B, A)
+        next_obs = self._rows(next_obs, self.obs_dim, "next_obs")
+        actions = self._act(next_obs, slow=True)  # (K, B, A)
         noise = rng.normal(0, self.sigma, actions.shape)
         noise = np.clip(noise, -self.limit, self.limit)
         actions = np.clip(actions + noise, -1, 1).astype(self.dtype)
-        return self._q(np.asarray(next_obs, self.dtype), actions, slow=True)
+        return self._q(next_obs, actions, slow=True)
 
     def update(self, batch, climb=True):
         """As `Agent.update`; the actors climb at every second one only."""
@@ -39,14 +40,13 @@ class TD3Agent(NumpyAgent):
 
 
 class TD3Training(Training):
-    """Trains `TD3Agent`. ValueError for another algorithm, backend or target_every."""
+    """Trains `TD3Agent`. ValueError for another algorithm or target_every."""
 
     agent_class = TD3Agent
 
     def __init__(self, config):
-        expected = ("DCN-DDPG", self.agent_class.every, "numpy")
-        if (config.algorithm, config.target_every, config.backend) != expected:
-            raise ValueError("TD3 is DCN-DDPG in NumPy, with target_every="
-                             f"{expected[1]}; got {config.algorithm!r}, "
-                             f"{config.target_every}, backend={config.backend!r}.")
+        expected = "DCN-DDPG", self.agent_class.every
+        if (config.algorithm, config.target_every) != expected:
+            raise ValueError(f"TD3 is DCN-DDPG with target_every={expected[1]}; got "
+                             f"{config.algorithm!r}, {config.target_every}.")
         super().__init__(config)

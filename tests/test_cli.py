@@ -53,6 +53,12 @@ def trained(tmp_path_factory):
 # --- help -----------------------------------------------------------------------------
 
 
+def test_a_stream_that_knows_no_greek_gets_it_escaped():
+    """A file on Windows is written in cp1252, say."""
+    shown = cli("train", "--help", PYTHONUTF8="0", PYTHONIOENCODING="ascii")
+    assert shown.returncode == 0 and "\\u03b3" in shown.stdout, shown.stderr
+
+
 def test_help_explains_every_field_of_config():
     text = " ".join(cli("train", "--help").stdout.replace("│", " ").split())
     source = inspect.getsource(Config)

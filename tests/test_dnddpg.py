@@ -467,7 +467,6 @@ WRONG = [  # field, wrong value, what the sentence must also say
     ("nu", -0.5, "0 or more"),
     ("y_min", math.nan, "number"),
     ("hidden", (), "widths"),
-    ("hidden", (64, 0), "widths"),
     ("hidden", 64, "widths"),
     ("task", 7, "name"),
 ]
@@ -480,6 +479,12 @@ def test_a_wrong_value_is_refused_by_field_value_and_what_is_allowed(field, valu
         Config(**{field: value})
     text = str(refusal.value)
     assert field in text and repr(value) in text and also in text, text
+
+
+@pytest.mark.parametrize("width", [0, 2.5, True, "64", None])
+def test_a_wrong_width_of_a_layer_is_named(width):
+    with pytest.raises(ValueError, match=f"hidden={width!r}.*whole number, 1 or more"):
+        Config(hidden=(64, width))
 
 
 def test_steps_and_episodes_cannot_both_end_a_run():

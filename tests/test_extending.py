@@ -103,8 +103,25 @@ def test_a_training_with_an_agent_of_its_own_resumes_bit_for_bit(tmp_path):
 
 def test_a_plain_training_does_not_go_on_with_another_agents_run(tmp_path):
     LargestTraining(Config(**PENDULUM)).save(tmp_path / "run.npz")
-    with pytest.raises(ValueError, match="its agent is a Largest.*NumpyAgent"):
+    with pytest.raises(ValueError, match="LargestTraining and Largest, and this is Tr"):
         Training.load(tmp_path / "run.npz")
+
+
+def test_a_plain_training_does_not_go_on_with_another_trainings_run(tmp_path):
+    """Even if the agent is the same: a Training may store or explore otherwise."""
+    class Bold(Training):
+        def _explore(self, obs):
+            return np.sign(super()._explore(obs))
+
+    Bold(Config(**PENDULUM)).save(tmp_path / "run.npz")
+    assert Bold.load(tmp_path / "run.npz").step == 0
+    with pytest.raises(ValueError, match="it is of Bold and NumpyAgent, and this"):
+        Training.load(tmp_path / "run.npz")
+
+
+def test_a_numpy_agent_of_ones_own_does_not_stand_in_for_pytorch(tmp_path):
+    with pytest.raises(ValueError, match="backend='torch'.*'numpy' for a Largest"):
+        LargestTraining(Config(**PENDULUM, backend="torch"))
 
 
 def test_actors_that_climb_more_rarely_have_a_step_count_of_their_own(tmp_path):
@@ -139,6 +156,34 @@ def test_a_file_from_before_the_actors_counted_counts_as_if_they_always_climbed(
     del old["climbs"]
     agent.set_arrays(old)
     assert (agent.updates, agent.actor_updates) == (7, 7)
+
+
+class Strict(gym.Env):
+    """A task that looks at its actions: are they of its space, and of its dtype?"""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Box(np.float32([-1, 0]), np.float32([3, 0.7]))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), (action, action.dtype)
+        return np.zeros(2, np.float32), float(action.sum()), False, False, {}
+
+
+def test_a_task_that_checks_its_actions_gets_them_in_its_own_dtype():
+    gym.register("Strict-v0", entry_point=Strict, max_episode_steps=20)
+    try:
+        training = Training(Config("Strict-v0", hidden=(8,), batch_size=8, warmup=20,
+                                   steps=60, sigma=2.0, evaluate_every=30))
+        for record in training:
+            if record.kind == "grid":
+                bias.evaluate(training)
+        assert training.finished
+    finally:
+        gym.registry.pop("Strict-v0")
 
 
 class NoPictures(gym.Env):

@@ -944,6 +944,21 @@ def test_in_env_units_replay_holds_what_the_torque_is():
     np.testing.assert_array_equal(wrong.replay.arrays.obs, right.replay.arrays.obs)
 
 
+def test_without_a_home_the_checkpoints_folder_is_asked_for(monkeypatch):
+    def nowhere():
+        raise RuntimeError("no home")
+
+    monkeypatch.setattr(study.Path, "home", nowhere)
+    for name in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.setenv(name, "/somewhere")
+    if sys.platform != "darwin":
+        assert study.default_scratch() == Path("/somewhere/dnddpg_minimal")
+    for name in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(name)
+    with pytest.raises(OSError, match="--scratch FOLDER"):
+        study.default_scratch()
+
+
 def test_a_faulty_agent_refuses_what_it_was_not_written_for():
     with pytest.raises(ValueError, match="written for DDPG"):
         bugs.LostAxis(tiny("DN-DDPG").config)

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import numpy as np
@@ -685,6 +686,17 @@ def test_a_run_killed_at_a_random_moment_goes_on_as_if_never_killed(task, tmp_pa
 
 
 # --- files that are no runs -----------------------------------------------------------
+
+
+def test_two_threads_may_write_one_file(tmp_path):
+    def write(number):
+        for _ in range(50):
+            write_npz(tmp_path / "one.npz", number=np.full(1_000, number))
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(write, range(2)))  # raises what a thread raised
+    assert len(set(read_npz(tmp_path / "one.npz")["number"])) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["one.npz"]
 
 
 def test_a_damaged_or_foreign_run_is_refused(tmp_path):
