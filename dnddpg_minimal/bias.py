@@ -354,16 +354,15 @@ def largest_tail(gamma, steps, largest):
     return gamma**steps * largest / (1 - gamma) if gamma < 1 else np.inf
 
 
-def true_q(world, states, action, agent, rule=None):
+def true_q(world, states, action, agent):
     """Q^pi(s, a) of N states (N, S) and actions (N, A) in [-1, 1]: (N,).
 
-    world: of `dynamics`; agent, rule: as in `greedy`.
+    world: of `dynamics`; pi is agent.act.
     """
-    policy, gamma = greedy(agent, rule), agent.config.gamma
-    truth = []
+    gamma, truth = agent.config.gamma, []
     for start in range(0, len(states), PORTION):
         part = slice(start, start + PORTION)
-        found = rollout(world, states[part], policy, gamma, None, action[part])
+        found = rollout(world, states[part], agent.act, gamma, None, action[part])
         truth.append(found["truth"])
     return np.concatenate(truth)
 
