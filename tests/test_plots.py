@@ -1,5 +1,6 @@
 """Figures draw what they are given, and mean the same thing everywhere."""
 
+import inspect
 import re
 from pathlib import Path
 
@@ -111,6 +112,64 @@ def test_a_figure_can_be_drawn_into_axes_of_ones_own(picture):
     assert plots.plot_error_plane(picture, axes=axes) is axes
     assert plots.plot_truth(picture, ax=axes[0]) is axes[0]
     assert plt.get_fignums() == [figure.number]
+
+
+X = np.arange(1.0, 4)
+RUNS, MAP, ENDS = np.array([X, X]), np.outer(X, X) - 1, (0.0, 5.0)
+PLANE = dict(x=X, y=X, q=MAP[None], truth=MAP)
+TABLE = pd.DataFrame(dict(algorithm="DDPG", seed=0, step=X, bias=X))
+STATE = np.array([0.0, 1.0, 300.0, 250.0, 0.0])  # of an arm
+ONE_PANEL = {  # the least that each figure of panels can draw
+    "plot_ablations": ({"no memory": (X, RUNS)}, (X, RUNS)),
+    "plot_along_action": (X, {"a state": (X, X)}, {"offset": (X, X)}),
+    "plot_arm": (STATE,),
+    "plot_climbing": ((X, X), (X, X), 1, 2),
+    "plot_consequences": ({"return": {"a reading": (X, ENDS)}},),
+    "plot_coverage": (X, {"normal": {"t": X}}),
+    "plot_differences_by_seed": ({"bias": {"a pair": (X, ENDS)}},),
+    "plot_eight_tasks": ({"Hopper-v5": {"DDPG": (X, RUNS)}},),
+    "plot_error_and_share": ({0: PLANE | {"error": MAP[None]}}, 1),
+    "plot_error_plane": (PLANE,),
+    "plot_fastest": (MAP, STATE, [STATE], [9]),
+    "plot_found_or_not": ({"an agent": PLANE},),
+    "plot_growth": ({"a case": {"γ = 0.9": (X, 3)}},),
+    "plot_hovering": ({"arrive": 1}, {"an agent": X}),
+    "plot_joint_errors": ({"ArmEasy-v0": {"DDPG": MAP}}, 1),
+    "plot_learned_q": (X, X, {0: MAP}, [(X, X, X)], 1),
+    "plot_line_up": ({"A": dict(right=(X, RUNS), tests=(X, RUNS), q=(X, X, X))},),
+    "plot_live": ([Record("episode", 3, 0, 0, 1.0, 3, None, None)], [
+        dict(algorithm="DDPG", step=3, mean=1, standard_error=1, n=2)], X, X, 0),
+    "plot_maximum": (X, 1, X, {"closed form": X}, {"closed form": X}),
+    "plot_mean_planes": ({"DDPG": {0: PLANE | {"error": MAP}}}, 1),
+    "plot_memory": (np.array([X, X]), {"a batch": [0]}),
+    "plot_over_training": (TABLE, {"bias": "Q − truth"}),
+    "plot_owed": (TABLE, (X, X), {"frozen": (X, RUNS)}, (X, X)),
+    "plot_paired_by_task": ({"a pair": {"Hopper-v5": (X, ENDS, ENDS)}},),
+    "plot_practice": ({"A": dict(episodes=(X, X), tests=(X, X))},),
+    "plot_price": (X, {"measured": X}, {"measured": X}),
+    "plot_profile": (X, {"DDPG": X}, {"all tasks": {"DDPG": (1, *ENDS)}}),
+    "plot_pushes": ({"noise": (X, X)},),
+    "plot_questions": ({"agents": {"A": (X, X)}},),
+    "plot_reaching": ({"ArmEasy-v0": TABLE}, {"bias": "Q − truth"}),
+    "plot_restored": ({"Hopper-v5": {"kept": X}},),
+    "plot_steps": ({"a case": (X, X, X)}, {"a case": (1, 2, 3)}),
+    "plot_table_1": ({"slow": (X, X)}, X, -1),
+    "plot_true_q": (X, X, MAP, {"best": X}),
+    "plot_visits": ({"a run": dict(counts=MAP, x=X, y=X)}, X - 3, X, MAP),
+    "plot_who_acts": (X, {"a rule": RUNS}, {"a rule": RUNS}),
+}
+
+
+@pytest.mark.parametrize("name", [
+    name for name in plots.__all__ if name.startswith("plot_")
+    and "axes" in inspect.signature(getattr(plots, name)).parameters])
+def test_a_figure_of_panels_can_have_one_and_takes_axes_as_pyplot_gives_them(name):
+    draw = getattr(plots, name)
+    axes = draw(*ONE_PANEL[name])
+    assert np.ravel(axes)[0].has_data()
+    own = np.squeeze(axes)[()]  # without empty dimensions: one panel, or a row
+    assert draw(*ONE_PANEL[name], axes=own) is own
+    assert len(plt.get_fignums()) == 1
 
 
 def test_every_group_of_runs_is_drawn_in_a_colour_of_its_own():

@@ -26,7 +26,7 @@ caller, who knows it, passes them.
 | `plot_price(slopes, bias, lost)` | what a critic's slope costs |
 | `plot_y(y, expected)` | what one noisy target says, as a histogram |
 | `plot_maximum(…)` | the same, and its mean over the number of actions |
-| `plot_growth(panels)` | a bias made anew in each target, piling up |
+| `plot_growth(cases)` | a bias made anew in each target, piling up |
 | `plot_steps(curves, points)` | two actors' steps on a true and a learned Q |
 | `plot_error_and_share(pictures, limit)` | mean error planes, share of seeds above 0 |
 | `plot_owed(table, owed, control, debt)` | bias, what lag owes, frozen actors |
@@ -137,7 +137,6 @@ from dnddpg_minimal.plots.overestimation import (
     plot_maximum,
     plot_owed,
     plot_steps,
-    plot_targets,
     plot_y,
 )
 from dnddpg_minimal.plots.paper_court import (
@@ -157,8 +156,10 @@ from dnddpg_minimal.plots.silent_bugs import (
 from dnddpg_minimal.plots.style import (
     ERRORS,
     GREY,
+    MARKS,
     ONE,
     SIGN,
+    SIGN_BAR,
     SIGN_TURNED,
     STYLE,
     THREE,
@@ -173,6 +174,8 @@ from dnddpg_minimal.plots.style import (
     legend_below,
     note_level,
     pale,
+    panels,
+    shades,
     shrink,
     style_of,
     thousands,
@@ -192,23 +195,23 @@ from dnddpg_minimal.plots.value_and_policy import (
 )
 
 __all__ = [
-    "ERRORS", "FATES", "GREY", "ONE", "SIGN", "SIGN_TURNED", "STYLE", "THREE", "TRUTH",
-    "TWO", "VALUES", "WRONG", "angle_ticks", "draw_arm", "draw_lines", "draw_map",
-    "draw_room",
-    "is_angle", "legend_below", "note_level", "pale", "photograph", "plot_ablations",
-    "plot_actor", "plot_along_action", "plot_arm", "plot_bias", "plot_bias_and_return",
-    "plot_body", "plot_climbing", "plot_consequences", "plot_coverage", "plot_decay",
-    "plot_decays", "plot_differences_by_seed", "plot_distance", "plot_eight_tasks",
-    "plot_ends", "plot_energy_paths", "plot_error_and_share", "plot_error_plane",
-    "plot_fastest", "plot_fates", "plot_filmstrip", "plot_finite_differences",
-    "plot_found_or_not", "plot_growth", "plot_hill", "plot_hovering",
-    "plot_joint_errors", "plot_kept", "plot_lag", "plot_learned_q", "plot_learning",
-    "plot_line_up", "plot_links", "plot_live", "plot_maximum", "plot_mean_planes",
-    "plot_memory", "plot_one_backup", "plot_over_training", "plot_owed",
-    "plot_paired_by_task", "plot_partial_sums", "plot_parts", "plot_practice",
-    "plot_price", "plot_profile", "plot_pushes", "plot_q", "plot_questions",
-    "plot_reaching", "plot_readings", "plot_restored", "plot_returns", "plot_runs",
-    "plot_slices", "plot_slope_ways", "plot_steps", "plot_table_1", "plot_targets",
-    "plot_true_q", "plot_truth", "plot_verdicts", "plot_visits", "plot_who_acts",
-    "plot_y", "shrink", "style_of", "thousands", "write_bodies", "zero_line",
+    "ERRORS", "FATES", "GREY", "MARKS", "ONE", "SIGN", "SIGN_BAR", "SIGN_TURNED",
+    "STYLE", "THREE", "TRUTH", "TWO", "VALUES", "WRONG", "angle_ticks", "draw_arm",
+    "draw_lines", "draw_map", "draw_room", "is_angle", "legend_below", "note_level",
+    "pale", "panels", "photograph", "plot_ablations", "plot_actor", "plot_along_action",
+    "plot_arm", "plot_bias", "plot_bias_and_return", "plot_body", "plot_climbing",
+    "plot_consequences", "plot_coverage", "plot_decay", "plot_decays",
+    "plot_differences_by_seed", "plot_distance", "plot_eight_tasks", "plot_ends",
+    "plot_energy_paths", "plot_error_and_share", "plot_error_plane", "plot_fastest",
+    "plot_fates", "plot_filmstrip", "plot_finite_differences", "plot_found_or_not",
+    "plot_growth", "plot_hill", "plot_hovering", "plot_joint_errors", "plot_kept",
+    "plot_lag", "plot_learned_q", "plot_learning", "plot_line_up", "plot_links",
+    "plot_live", "plot_maximum", "plot_mean_planes", "plot_memory", "plot_one_backup",
+    "plot_over_training", "plot_owed", "plot_paired_by_task", "plot_partial_sums",
+    "plot_parts", "plot_practice", "plot_price", "plot_profile", "plot_pushes",
+    "plot_q", "plot_questions", "plot_reaching", "plot_readings", "plot_restored",
+    "plot_returns", "plot_runs", "plot_slices", "plot_slope_ways", "plot_steps",
+    "plot_table_1", "plot_true_q", "plot_truth", "plot_verdicts", "plot_visits",
+    "plot_who_acts", "plot_y", "shades", "shrink", "style_of", "thousands",
+    "write_bodies", "zero_line",
 ]

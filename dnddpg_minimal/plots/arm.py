@@ -9,12 +9,15 @@ from dnddpg_minimal.plots.style import (
     ERRORS,
     GREY,
     ONE,
+    SIGN_BAR,
     STYLE,
     THREE,
     TRUTH,
     TWO,
     VALUES,
     pale,
+    panels,
+    shades,
     thousands,
 )
 
@@ -59,10 +62,7 @@ def plot_arm(state, paths=(), q=None, axes=None, title=""):
     actor alone acts. q (C, K): critic c's opinion of actor k's proposal, or None.
     axes: three of them.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, 3, figsize=(7.6, 2.8), layout="constrained",
-                                    width_ratios=(1, 0.6, 0.8))
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, 3, figsize=(7.6, 2.8), width_ratios=(1, 0.6, 0.8))
     room, seen, opinion = axes
     draw_room(room, state[2:4])
     for k, path in enumerate(paths):
@@ -124,12 +124,12 @@ def draw_joints(ax, values, colours, low=None, high=None, norm=None):
     return image
 
 
-def draw_goal_over_joints(ax, goal=arm.EASY_GOAL):
-    """The edge of the goal (xy), px, over the two joints: a spot for each branch."""
+def draw_goal_over_joints(ax):
+    """The edge of the easy goal over the two joints: a spot for each branch."""
     side = np.linspace(0, 2 * np.pi, 161)
     states = np.zeros((side.size**2, 5))
     states[:, 0], states[:, 1] = np.tile(side, side.size), np.repeat(side, side.size)
-    states[:, 2:4] = goal
+    states[:, 2:4] = arm.EASY_GOAL
     on_goal = arm.observe(states)[:, 8].reshape(side.size, side.size)
     ax.contour(side, side, on_goal, [0.5], colors="black", linewidths=0.9)
 
@@ -140,10 +140,7 @@ def plot_fastest(steps, start, ends, counts, axes=None, title=""):
     steps (N, N): steps to the easy goal, [joint 2, joint 1]. start (5,); ends: a state
     (5,) for each elbow branch; counts: the steps that each takes.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, 2, figsize=(7, 3), layout="constrained",
-                                    width_ratios=(1.15, 1))
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, 2, figsize=(7, 3), width_ratios=(1.15, 1))
     colours = plt.get_cmap(VALUES, 8)
     image = draw_joints(axes[0], steps, colours, norm=BoundaryNorm(range(0, 33, 4), 8))
     axes[0].figure.colorbar(image, ax=axes[0], label="steps to the goal")
@@ -173,14 +170,12 @@ def plot_reaching(tables, columns, references=None, log=(), axes=None, title="")
     logarithmic above 1. A thin line for each seed, the mean thick.
     references: {(task, column): one number}, drawn as a black line.
     """
-    if axes is None:
-        figure, axes = plt.subplots(len(tables), len(columns), figsize=(6, 3.1),
-                                    squeeze=False, sharex=True,
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, len(tables), len(columns), figsize=(6, 3.1),
+                  squeeze=False, sharex=True)
+    grid = np.reshape(axes, (len(tables), len(columns)))
     for r, (task, table) in enumerate(tables.items()):
         for c, (column, label) in enumerate(columns.items()):
-            ax = axes[r, c]
+            ax = grid[r, c]
             for name, runs in table.groupby("algorithm", sort=False):
                 seeds = runs.pivot(index="step", columns="seed", values=column)
                 style = STYLE[name]
@@ -199,11 +194,11 @@ def plot_reaching(tables, columns, references=None, log=(), axes=None, title="")
             ax.set_title(label if r == 0 else "", loc="center", fontsize=9)
             thousands(ax)
             ax.xaxis.set_major_locator(plt.MaxNLocator(4))
-        axes[r, 0].set_ylabel(task)
-    for ax in axes[-1]:
+        grid[r, 0].set_ylabel(task)
+    for ax in grid[-1]:
         ax.set_xlabel("environment steps")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    axes[0, 0].figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    grid[0, 0].figure.legend(handles, labels, loc="outside lower center", ncols=3)
     return axes
 
 
@@ -214,26 +209,22 @@ def plot_joint_errors(pictures, limit, axes=None, title=""):
     ±limit. The black line is the edge of the goal.
     """
     rows, columns = len(pictures), max(map(len, pictures.values()))
-    if axes is None:
-        figure, axes = plt.subplots(rows, columns, sharex=True, sharey=True,
-                                    figsize=(1.75 * columns + 1.2, 1.6 * rows + 0.5),
-                                    squeeze=False, layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, rows, columns, sharex=True, sharey=True,
+                  figsize=(1.75 * columns + 1.2, 1.6 * rows + 0.5), squeeze=False)
+    grid = np.reshape(axes, (rows, columns))
     for r, (task, maps) in enumerate(pictures.items()):
-        for ax in axes[r, len(maps):]:
+        for ax in grid[r, len(maps):]:
             ax.axis("off")
-        for ax, (name, error) in zip(axes[r], maps.items()):
-            # Few shades, and none is white, so that the sign is always seen
-            shades = (np.floor(error / limit * 4) + 0.5) / 4 * limit
-            image = draw_joints(ax, shades, ERRORS, -limit, limit)
+        for ax, (name, error) in zip(grid[r], maps.items()):
+            image = draw_joints(ax, shades(error, limit, 4), ERRORS, -limit, limit)
             draw_goal_over_joints(ax)
             mean = f"{round(error.mean(), 2) + 0.0:+.2f}".replace("-", "−")
             ax.set_title(f"{name}, mean {mean}", loc="center", fontsize=8.5)
             if r == rows - 1:
                 ax.set_xlabel("joint 1")
-        axes[r, 0].set_ylabel(f"{task}\njoint 2")
-    bar = axes[0, 0].figure.colorbar(image, ax=axes, extend="both")
-    bar.set_label("← underestimates    overestimates →", fontsize=8)
+        grid[r, 0].set_ylabel(f"{task}\njoint 2")
+    bar = grid[0, 0].figure.colorbar(image, ax=axes, extend="both")
+    bar.set_label(SIGN_BAR, fontsize=8)
     return axes
 
 

@@ -7,6 +7,7 @@ from dnddpg_minimal.plots.style import (
     ERRORS,
     ONE,
     SIGN,
+    SIGN_BAR,
     SIGN_TURNED,
     STYLE,
     THREE,
@@ -14,9 +15,12 @@ from dnddpg_minimal.plots.style import (
     TWO,
     angle_ticks,
     draw_map,
+    is_angle,
     legend_below,
     note_level,
     pale,
+    panels,
+    shades,
     thousands,
 )
 
@@ -56,10 +60,7 @@ def plot_over_training(table, columns, log=(), limits=None, axes=None, title="")
     named in `log` a logarithmic axis; limits: a column's name to (low, high). Steps at
     which something was not measured (NaN) are passed over.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, len(columns), figsize=(7, 2.7), squeeze=False,
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, len(columns), figsize=(7, 2.7), squeeze=False)
     for ax, (column, label) in zip(np.ravel(axes), columns.items()):
         if column == "bias":
             ax.axhline(0, **TRUTH)
@@ -130,27 +131,24 @@ def plot_mean_planes(planes, limit, axes=None, title=""):
     y (N,) and error (N, N). Colours end at ±limit.
     """
     rows, columns = len(planes), len(next(iter(planes.values())))
-    if axes is None:
-        figure, axes = plt.subplots(rows, columns, sharex=True, sharey=True,
-                                    figsize=(1.6 * columns + 1, 1.2 * rows + 0.7),
-                                    squeeze=False, layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, rows, columns, sharex=True, sharey=True,
+                  figsize=(1.6 * columns + 1, 1.2 * rows + 0.7), squeeze=False)
+    grid = np.reshape(axes, (rows, columns))
     for r, (name, pictures) in enumerate(planes.items()):
-        for ax, (step, picture) in zip(axes[r], pictures.items()):
-            # Few shades, and none is white, so that the sign is always seen.
-            shades = (np.floor(picture["error"] / limit * 5) + 0.5) / 5 * limit
-            image = draw_map(ax, picture, shades, ERRORS, -limit, limit)
+        for ax, (step, picture) in zip(grid[r], pictures.items()):
+            shown = shades(picture["error"], limit, 5)
+            image = draw_map(ax, picture, shown, ERRORS, -limit, limit)
             note_mean(ax, picture["error"])
-            if np.allclose(picture["x"][-1], np.pi, atol=0.01):
+            if is_angle(picture["x"]):
                 angle_ticks(ax, every=2)
             if r == 0:
                 ax.set_title(f"step {step:,}".replace(",", " "), loc="center",
                              fontsize=9)
             if r < rows - 1:
                 ax.set_xlabel("")
-        axes[r, 0].set_ylabel(f"{name}\nvelocity")
-    bar = axes[0, 0].figure.colorbar(image, ax=axes, extend="both")
-    bar.set_label("← underestimates    overestimates →", fontsize=8)
+        grid[r, 0].set_ylabel(f"{name}\nvelocity")
+    bar = grid[0, 0].figure.colorbar(image, ax=axes, extend="both")
+    bar.set_label(SIGN_BAR, fontsize=8)
     return axes
 
 
@@ -175,11 +173,9 @@ def plot_differences_by_seed(differences, predicted=None, axes=None, title=""):
     (values (n,), (low, high)). predicted: the same labels and names to one number, a
     cross; a panel without a prediction may be missing.
     """
-    if axes is None:
-        rows = max(map(len, differences.values()))
-        figure, axes = plt.subplots(1, len(differences), sharey=True,
-                                    figsize=(8, 1 + 0.6 * rows), layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    rows = max(map(len, differences.values()))
+    axes = panels(axes, title, 1, len(differences), sharey=True,
+                  figsize=(8, 1 + 0.6 * rows))
     for ax, (label, pairs) in zip(np.ravel(axes), differences.items()):
         ax.axvline(0, **TRUTH)
         for n, (values, interval) in enumerate(pairs.values()):

@@ -18,6 +18,7 @@ from dnddpg_minimal.plots.style import (
     legend_below,
     note_level,
     pale,
+    panels,
     shrink,
     thousands,
 )
@@ -32,13 +33,13 @@ def plot_memory(memory, batches, axes=None):
     if axes is None:
         _, axes = plt.subplots(1, len(batches), figsize=(6.6, 2.7), sharey=True,
                                layout="constrained")
-    for ax, (title, rows) in zip(axes, batches.items(), strict=True):
+    for ax, (title, rows) in zip(np.ravel(axes), batches.items(), strict=True):
         ax.plot(*memory.T, "s", color="0.8", markersize=1.6, markeredgewidth=0)
         ax.plot(*memory[rows].T, "o", color=STYLE["DDPG"]["color"], markersize=4,
                 markeredgewidth=0)
         ax.set(title=title, xlabel="angle (0 is upright)")
         angle_ticks(ax)
-    axes[0].set_ylabel("velocity")
+    np.ravel(axes)[0].set_ylabel("velocity")
     return axes
 
 
@@ -109,11 +110,9 @@ def plot_ablations(runs, whole, axes=None, title=""):
     each of S seeds and their mean; whole: (steps, returns) with nothing taken out, its
     mean alone, in every panel.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, len(runs), figsize=(6.8, 2.5), sharey=True,
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    for ax, (name, (steps, returns)) in zip(axes, runs.items(), strict=True):
+    axes = panels(axes, title, 1, len(runs), figsize=(6.8, 2.5), sharey=True)
+    flat = np.ravel(axes)
+    for ax, (name, (steps, returns)) in zip(flat, runs.items(), strict=True):
         ax.plot(steps, returns.T, color=pale(WRONG["color"], 0.7), linewidth=0.7)
         ax.plot(whole[0], whole[1].mean(axis=0), linewidth=1.8, label="whole DDPG",
                 **STYLE["DDPG"])
@@ -122,15 +121,15 @@ def plot_ablations(runs, whole, axes=None, title=""):
         ax.set(xlabel="environment steps")
         ax.xaxis.set_major_locator(plt.MaxNLocator(3))
         thousands(ax)
-    axes[0].set_ylabel("return of an episode")
-    axes[-1].legend(loc="lower right")
+    flat[0].set_ylabel("return of an episode")
+    flat[-1].legend(loc="lower right")
     return axes
 
 
-def plot_filmstrip(pictures, ax=None, title="", count=10, dt=0.05):
+def plot_filmstrip(pictures, ax=None, title="", count=10):
     """A rollout as `count` pictures side by side, the time written under each.
 
-    pictures: arrays (height, width, 3) uint8, one per step of `dt` seconds.
+    pictures: arrays (height, width, 3) uint8, one per step of 0.05 seconds.
     """
     chosen = np.linspace(0, len(pictures) - 1, count).round().astype(int)
     height, width = pictures[0].shape[:2]
@@ -144,7 +143,7 @@ def plot_filmstrip(pictures, ax=None, title="", count=10, dt=0.05):
     for n in range(1, count):
         ax.axvline(n * w - 0.5, color="0.85", linewidth=1)
     ax.set_xticks([(n + 0.5) * w for n in range(count)],
-                  [f"{i * dt:.1f} s" for i in chosen])
+                  [f"{i * 0.05:.1f} s" for i in chosen])
     ax.set(yticks=[], title=title)
     ax.spines[:].set_visible(False)
     ax.tick_params(length=0)
@@ -177,18 +176,15 @@ def plot_truth(picture, path=None, ax=None, title=""):
     return ax
 
 
-def plot_error_plane(picture, critic=0, axes=None, title="", limit=None):
-    """Truth, critic and error over the state plane, side by side.
+def plot_error_plane(picture, axes=None, title="", limit=None):
+    """Truth, first critic and error over the state plane, side by side.
 
     picture: what `bias.plane` returns. The first two panels share one scale. In the
     third, red is where the critic overestimates, blue where it underestimates; colours
     end at ±`limit`, by default the 99th percentile of the error's size.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, 3, figsize=(7.6, 2.7), sharey=True,
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    q, truth = picture["q"][critic], picture["truth"]
+    axes = panels(axes, title, 1, 3, figsize=(7.6, 2.7), sharey=True)
+    q, truth = picture["q"][0], picture["truth"]
     error = q - truth
     limit = np.quantile(np.abs(error), 0.99) if limit is None else limit
     low, high = min(q.min(), truth.min()), max(q.max(), truth.max())

@@ -4,12 +4,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from dnddpg_minimal.plots.style import (
+    MARKS,
     ONE,
     STYLE,
     THREE,
     TRUTH,
     TWO,
     pale,
+    panels,
     thousands,
 )
 
@@ -32,18 +34,17 @@ def plot_eight_tasks(curves, interval=None, seeds=False, limits=None, xlabel="",
     a task without algorithms gets an empty panel that says how to record it. interval:
     a function of values that gives (low, high), drawn as a shade from 3 runs on; seeds:
     every run as a thin line; limits: a dict from a task to its axis' (low, high);
-    xlabel: what x is.
+    xlabel: what x is. Axes of your own get neither this label nor a legend.
     """
-    if axes is None:
+    own = axes is None
+    if own:
         rows = -(-len(curves) // 4)
-        figure, axes = plt.subplots(rows, min(4, len(curves)), squeeze=False,
-                                    figsize=(7, 1.55 * rows + 0.4),
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-        figure.supxlabel(xlabel, fontsize=9)
-        figure.supylabel("return of an episode", fontsize=9)
-    for n, (ax, (task, of_algorithms)) in enumerate(zip(np.ravel(axes),
-                                                        curves.items())):
+        axes = panels(None, title, rows, min(4, len(curves)), squeeze=False,
+                      figsize=(7, 1.55 * rows + 0.4))
+        axes[0, 0].figure.supxlabel(xlabel, fontsize=9)
+        axes[0, 0].figure.supylabel("return of an episode", fontsize=9)
+    flat = np.ravel(axes)
+    for n, (ax, (task, of_algorithms)) in enumerate(zip(flat, curves.items())):
         counts = [len(values) for _, values in of_algorithms.values()]
         several = f"{min(counts)}–{max(counts)}" if len(set(counts)) > 1 else counts[:1]
         runs = f", n = {several}".translate({ord(c): None for c in "[]"})
@@ -66,12 +67,11 @@ def plot_eight_tasks(curves, interval=None, seeds=False, limits=None, xlabel="",
             ax.yaxis.set_major_locator(plt.MaxNLocator(3))
             ax.set_ylim((limits or {}).get(task))
             thousands(ax)
-    shown = [ax for ax in np.ravel(axes) if ax.get_legend_handles_labels()[1]]
-    if shown and axes[0, 0].figure._suptitle is not None:
-        lines = {label: line for ax in shown for line, label in
-                 zip(*ax.get_legend_handles_labels())}
-        axes[0, 0].figure.legend(lines.values(), lines, loc="upper right", ncols=3,
-                                 fontsize=8, borderaxespad=0.1)
+    lines = {label: line for ax in flat
+             for line, label in zip(*ax.get_legend_handles_labels())}
+    if own and lines:
+        flat[0].figure.legend(lines.values(), lines, loc="upper right", ncols=3,
+                              fontsize=8, borderaxespad=0.1)
     return axes
 
 
@@ -88,30 +88,26 @@ def not_recorded(ax, task):
     ax.set(xticks=[], yticks=[])
 
 
-def plot_coverage(n, shares, claimed=0.95, axes=None, title=""):
-    """How often intervals hold the truth, over the number of runs: a panel per law.
+def plot_coverage(n, shares, axes=None, title=""):
+    """How often 95 % intervals hold the truth, over the runs: a panel per law.
 
     n (N,); shares: a dict from a law to a dict from a kind of interval to (N,).
-    claimed: the share that the intervals promise.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, len(shares), figsize=(7, 2.6), sharey=True,
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    axes = np.ravel(axes)
-    for ax, (law, kinds) in zip(axes, shares.items()):
-        ax.axhline(claimed, **TRUTH)
+    axes = panels(axes, title, 1, len(shares), figsize=(7, 2.6), sharey=True)
+    flat = np.ravel(axes)
+    for ax, (law, kinds) in zip(flat, shares.items()):
+        ax.axhline(0.95, **TRUTH)
         for (kind, values), style, mark in zip(kinds.items(), (ONE, TWO, THREE), "osD"):
             ax.plot(n, values, marker=mark, markersize=4.5, label=kind, **style)
         ax.set(xscale="log", xlabel="runs, n", title=law)
         ax.minorticks_off()
         ax.set_xticks(n, [str(one) for one in n])
         ax.yaxis.set_major_formatter(lambda y, _: f"{y:.0%}")
-    axes[0].set_ylabel("intervals that hold the truth")
-    axes[0].annotate(f"claimed: {claimed:.0%}", (0.99, claimed), ha="right",
+    flat[0].set_ylabel("intervals that hold the truth")
+    flat[0].annotate("claimed: 95%", (0.99, 0.95), ha="right",
                      xycoords=("axes fraction", "data"), xytext=(0, 6),
                      textcoords="offset points", fontsize=8)
-    axes[-1].legend(loc="lower right")
+    flat[-1].legend(loc="lower right")
     return axes
 
 
@@ -121,9 +117,7 @@ def plot_profile(levels, profiles, iqms, axes=None, title=""):
     levels (L,); profiles: algorithm -> (L,). iqms: a dict from a label to a dict from
     an algorithm to (iqm, low, high); an interval that is NaN is not drawn.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, 2, figsize=(7.4, 2.7), layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, 2, figsize=(7.4, 2.7))
     left, right = axes
     for name, share in profiles.items():
         left.plot(levels, share, linewidth=1.8, label=name, **STYLE[name])
@@ -136,7 +130,7 @@ def plot_profile(levels, profiles, iqms, axes=None, title=""):
             colour = STYLE[name]["color"]
             if np.isfinite(interval).all():
                 right.plot(interval, [y, y], color=colour, linewidth=1.5)
-            right.plot(iqm, y, "osD"[n], color=colour, markersize=5,
+            right.plot(iqm, y, MARKS[name], color=colour, markersize=5,
                        label=name if row == 0 else None)
     right.xaxis.set_major_locator(plt.MaxNLocator(4))
     right.set_yticks(range(len(iqms)), list(iqms))
@@ -156,11 +150,9 @@ def plot_paired_by_task(differences, axes=None, title="", xlabel=""):
     """
     if axes is None:
         rows = max(map(len, differences.values()))
-        figure, axes = plt.subplots(1, len(differences), sharex=True, sharey=True,
-                                    figsize=(8, 0.8 + 0.34 * rows),
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-        figure.supxlabel(xlabel, fontsize=9)
+        axes = panels(None, title, 1, len(differences), sharex=True, sharey=True,
+                      figsize=(8, 0.8 + 0.34 * rows))
+        np.ravel(axes)[0].figure.supxlabel(xlabel, fontsize=9)
     for ax, (pair, tasks) in zip(np.ravel(axes), differences.items()):
         ax.axvline(0, **TRUTH)
         for n, (values, t, bootstrap) in enumerate(tasks.values()):
@@ -195,10 +187,7 @@ def plot_verdicts(table, tasks, ax=None, title=""):
     a claim that does not speak of a task leaves its field empty. A verdict that a
     correction for many questions takes away again has " alone" at its end, and is pale.
     """
-    if ax is None:
-        figure, ax = plt.subplots(figsize=(7.8, 0.7 + 0.33 * len(table)),
-                                  layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    ax = panels(ax, title, figsize=(7.8, 0.7 + 0.33 * len(table)))
     for y, row in enumerate(table.values()):
         for x, task in enumerate(tasks):
             if task not in row:

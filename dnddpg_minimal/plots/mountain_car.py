@@ -6,17 +6,19 @@ import numpy as np
 from dnddpg_minimal.plots.style import (
     ERRORS,
     GREY,
+    MARKS,
     ONE,
+    SIGN_BAR,
     STYLE,
     THREE,
     TRUTH,
     TWO,
     VALUES,
     draw_map,
+    panels,
 )
 
 GOAL = 0.45  # position of the flag
-MARKERS = {"DDPG": "o", "DCN-DDPG": "s", "DN-DDPG": "D"}
 
 
 def plot_energy_paths(x, y, energy, paths, ax=None, title=""):
@@ -41,14 +43,14 @@ def plot_energy_paths(x, y, energy, paths, ax=None, title=""):
     return ax
 
 
-def goal_line(ax, x, y, energy, color="black"):
-    """The line of the goal's energy, and the flag, in a color.
+def goal_line(ax, x, y, energy):
+    """The line of the goal's energy, and the flag.
 
     x (N,), y (M,) and energy (M, N) as in `plot_energy_paths`.
     """
     energy = np.where(x > GOAL + 0.01, np.nan, energy)  # beyond it the hill falls again
-    ax.contour(x, y, energy, [1.0], colors=color, linewidths=1.6, linestyles="--")
-    ax.axvline(GOAL, color=color, linewidth=1, linestyle=":")
+    ax.contour(x, y, energy, [1.0], colors="black", linewidths=1.6, linestyles="--")
+    ax.axvline(GOAL, color="black", linewidth=1, linestyle=":")
 
 
 def plot_pushes(cases, axes=None, title=""):
@@ -57,13 +59,10 @@ def plot_pushes(cases, axes=None, title=""):
     cases: a dict from a row's label to (push (T,), position (T + 1,)). Of the pushes
     only the first 200 are drawn.
     """
-    if axes is None:
-        height = 1.5 * len(cases) + 0.8
-        figure, axes = plt.subplots(len(cases), 2, figsize=(7.4, height), sharex="col",
-                                    sharey="col", squeeze=False,
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    for row, (label, (push, position)), style in zip(axes, cases.items(),
+    axes = panels(axes, title, len(cases), 2, sharex="col", sharey="col",
+                  figsize=(7.4, 1.5 * len(cases) + 0.8), squeeze=False)
+    grid = np.reshape(axes, (len(cases), 2))
+    for row, (label, (push, position)), style in zip(grid, cases.items(),
                                                      (TWO, ONE, THREE)):
         plain = style | {"linestyle": "-", "linewidth": 1}
         row[0].plot(push[:200], **plain)
@@ -73,13 +72,13 @@ def plot_pushes(cases, axes=None, title=""):
         row[1].axhline(GOAL, color="black", linestyle=":", linewidth=1.2)
         row[1].axhline(-np.pi / 6, color=GREY, linewidth=0.8)
         row[1].set_ylabel("position", fontsize=8.5)
-    axes[0, 1].annotate("flag", (0.01, GOAL), ha="left", va="top", fontsize=8.5,
+    grid[0, 1].annotate("flag", (0.01, GOAL), ha="left", va="top", fontsize=8.5,
                         xycoords=("axes fraction", "data"), xytext=(0, -3),
                         textcoords="offset points")
-    axes[0, 1].annotate("valley", (0.01, -np.pi / 6), ha="left", va="top", fontsize=8.5,
+    grid[0, 1].annotate("valley", (0.01, -np.pi / 6), ha="left", va="top", fontsize=8.5,
                         xycoords=("axes fraction", "data"), xytext=(0, -16),
                         textcoords="offset points")
-    for ax in axes[-1]:
+    for ax in grid[-1]:
         ax.set_xlabel("step")
     return axes
 
@@ -92,10 +91,7 @@ def plot_climbing(predicted, measured, best, usual, axes=None, title=""):
     reach the goal (N,).
     best, usual: values of θ that are marked in both panels.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, 2, figsize=(7.4, 2.8), sharex=True,
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, 2, figsize=(7.4, 2.8), sharex=True)
     axes[0].plot(*predicted, color="black", linewidth=1.8)
     axes[0].axhline(1, color=GREY, linewidth=1)
     axes[0].annotate("what the goal asks for", (0.02, 1), xytext=(0, -4), va="top",
@@ -127,11 +123,8 @@ def plot_visits(runs, x, y, energy, axes=None, title=""):
     run: counts (N, N), and the cells' edges x and y (N + 1,). Cells that were never
     visited stay white. x (N,), y (M,), energy (M, N): as in `plot_energy_paths`.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, len(runs), figsize=(2.6 * len(runs) + 1.2, 2.7),
-                                    sharex=True, sharey=True, squeeze=False,
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, len(runs), figsize=(2.6 * len(runs) + 1.2, 2.7),
+                  sharex=True, sharey=True, squeeze=False)
     colours = plt.get_cmap("viridis_r", 12)
     for ax, (label, run) in zip(np.ravel(axes), runs.items()):
         share = 100 * run["counts"] / run["counts"].sum()
@@ -156,12 +149,10 @@ def plot_found_or_not(pictures, axes=None, title=""):
     share one scale, and so do the errors; red is where the first critic overestimates,
     blue where it underestimates. The dotted line is the flag.
     """
-    if axes is None:
-        figure, axes = plt.subplots(len(pictures), 3, sharex=True, sharey=True,
-                                    figsize=(7.6, 1.9 * len(pictures) + 0.8),
-                                    squeeze=False, layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    for row, (label, picture) in zip(axes, pictures.items()):
+    axes = panels(axes, title, len(pictures), 3, sharex=True, sharey=True,
+                  figsize=(7.6, 1.9 * len(pictures) + 0.8), squeeze=False)
+    grid = np.reshape(axes, (len(pictures), 3))
+    for row, (label, picture) in zip(grid, pictures.items()):
         q, truth = picture["q"][0], picture["truth"]
         draw_map(row[0], picture, truth, VALUES, 0, 100)
         image = draw_map(row[1], picture, q, VALUES, 0, 100)
@@ -171,15 +162,15 @@ def plot_found_or_not(pictures, axes=None, title=""):
                        linestyle=":", linewidth=1)
             ax.set_xlabel("")
         row[0].set_ylabel(f"{label}\nvelocity", fontsize=8.5)
-    for ax, name in zip(axes[0], ("truth", "what the critic says", "Q − truth")):
+    for ax, name in zip(grid[0], ("truth", "what the critic says", "Q − truth")):
         ax.set_title(name, loc="center", fontsize=9)
-    for ax in axes[-1]:
+    for ax in grid[-1]:
         ax.set_xlabel("position")
-    figure = axes[0, 0].figure
-    bar = figure.colorbar(image, ax=axes[:, :2], extend="both")
+    figure = grid[0, 0].figure
+    bar = figure.colorbar(image, ax=grid[:, :2], extend="both")
     bar.set_label("discounted return", labelpad=-48)  # at its left
-    bar = figure.colorbar(errors, ax=axes[:, 2], extend="both")
-    bar.set_label("← underestimates    overestimates →", fontsize=8)
+    bar = figure.colorbar(errors, ax=grid[:, 2], extend="both")
+    bar.set_label(SIGN_BAR, fontsize=8)
     return axes
 
 
@@ -199,11 +190,11 @@ def plot_bias_and_return(groups, ax=None, title=""):
         raise ValueError(f"{len(groups)} groups: expected {len(colours)} at the most.")
     for (label, runs), colour in zip(groups.items(), colours):
         for name, of_name in runs.groupby("algorithm", sort=False):
-            ax.plot(of_name["bias"], of_name["mean"], MARKERS[name], markersize=7,
+            ax.plot(of_name["bias"], of_name["mean"], MARKS[name], markersize=7,
                     markerfacecolor="none", markeredgecolor=colour, markeredgewidth=1.2)
         ax.plot([], [], "s", markersize=7, color=colour, label=label)
     for name in STYLE:
-        ax.plot([], [], MARKERS[name], color="0.3", markerfacecolor="none", label=name)
+        ax.plot([], [], MARKS[name], color="0.3", markerfacecolor="none", label=name)
     ax.set_xscale("symlog", linthresh=1)
     low, high = ax.get_xlim()
     ax.set_xlim(min(low, -20), max(high, 20))

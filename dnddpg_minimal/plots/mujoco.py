@@ -15,12 +15,14 @@ from matplotlib.patheffects import withStroke
 from dnddpg_minimal.dnddpg import ALGORITHMS, MUJOCO_TASKS, Config
 from dnddpg_minimal.plots.ddpg import plot_learning
 from dnddpg_minimal.plots.style import (
+    MARKS,
     ONE,
     STYLE,
     THREE,
     TRUTH,
     TWO,
     pale,
+    panels,
 )
 
 CAMERA = dict(azimuth=90, elevation=-8)  # from the side, a little from above, degrees
@@ -32,7 +34,6 @@ CAMERAS = {  # task: distance in metres, and the point looked at
 }
 ASTRIDE = {"Walker2d-v5": (0, -0.03, 0, -0.25, 0, 0, 0.35, -0.35, 0)}  # joints, radians
 OVER_UNDER = "Q − truth\n(over ↑, under ↓)"
-MARKS = {"DDPG": "o", "DCN-DDPG": "s", "DN-DDPG": "^"}  # of single runs
 
 
 # --- The bodies -----------------------------------------------------------------------
@@ -199,17 +200,15 @@ def write_bodies(folder):
 # --- States put back ------------------------------------------------------------------
 
 
-def plot_restored(gaps, floor=1e-16, axes=None, title=""):
+def plot_restored(gaps, axes=None, title=""):
     """How far a world that was put back is from the one it should repeat.
 
     gaps: a dict from a task to a dict from a way of putting back to (T,): the largest
     difference in observation and reward after 1, 2, … T steps of the same actions.
-    Below `floor` the scale says 0.
+    Below 1e-16 the scale says 0.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, len(gaps), figsize=(7.4, 2.6), sharey=True,
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    floor = 1e-16
+    axes = panels(axes, title, 1, len(gaps), figsize=(7.4, 2.6), sharey=True)
     for ax, (task, ways) in zip(np.ravel(axes), gaps.items()):
         for (way, gap), style in zip(ways.items(), (ONE, TWO, THREE)):
             gap = np.maximum(gap, floor)
@@ -233,10 +232,7 @@ def plot_live(episodes, evaluations, q, truth, random, axes=None, title=""):
 
     episodes, evaluations, random: as in `plot_learning`; q, truth: as in `plot_kept`.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, 2, figsize=(7.4, 3), layout="constrained",
-                                    width_ratios=(5, 4))
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, 2, figsize=(7.4, 3), width_ratios=(5, 4))
     plot_learning(episodes, evaluations, random, ax=axes[0])
     axes[0].legend(loc="upper left", fontsize=8)
     axes[0].set_ylim(top=1.35 * axes[0].get_ylim()[1])
@@ -270,17 +266,6 @@ def plot_kept(q, truth, ax=None, title=""):
 # --- Recorded runs --------------------------------------------------------------------
 
 
-def four_panels(rows=1, height=2.6, title=""):
-    """A figure, `height` in inches, with a column for each MuJoCo task.
-
-    Returns (figure, axes (rows, 4)).
-    """
-    figure, axes = plt.subplots(rows, 4, figsize=(7.6, height), sharex=True,
-                                squeeze=False, layout="constrained")
-    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    return figure, axes
-
-
 def draw_runs(ax, table, column):
     """A column of a table, by algorithm: each seed thin, their mean thick."""
     for name in ALGORITHMS:
@@ -299,23 +284,23 @@ def draw_runs(ax, table, column):
                 **style)
 
 
-def finish(figure, axes, tasks, table):
-    """Titles, ticks, one legend below the figure; axes (rows, tasks).
+def finish(axes, table):
+    """Titles, ticks, one legend below the figure; axes (rows, 4), a column per task.
 
     Where `table` has no row of a task, its panels say so.
     """
-    for ax, task in zip(axes[0], tasks):
-        ax.set_title(task, loc="center", fontsize=9)
+    for column, task in zip(axes.T, MUJOCO_TASKS):
+        column[0].set_title(task, loc="center", fontsize=9)
         if not (table.task == task).any():
-            for one in axes[:, list(tasks).index(task)]:
-                say_missing(one)
+            for ax in column:
+                say_missing(ax)
     for ax in axes[-1]:
         ax.set_xlabel("steps / 1000")
         ax.xaxis.set_major_locator(plt.MaxNLocator(3))
         ax.xaxis.set_major_formatter(lambda x, _: f"{x / 1000:.0f}")
     for ax in np.ravel(axes):
         ax.tick_params(labelsize=8)
-    one_legend(figure, axes)
+    one_legend(axes)
 
 
 def say_missing(ax):
@@ -325,7 +310,7 @@ def say_missing(ax):
     ax.set_axis_off()
 
 
-def one_legend(figure, axes):
+def one_legend(axes):
     """One legend below all panels of a figure; algorithms first, in their order."""
     found = {}
     for ax in np.ravel(axes):
@@ -333,32 +318,31 @@ def one_legend(figure, axes):
         found |= dict(zip(labels, handles))
     names = [name for name in ALGORITHMS if name in found]
     names += [name for name in found if name not in names]
-    figure.legend([found[name] for name in names], names, ncols=5,
-                  loc="outside lower center")
+    ax.figure.legend([found[name] for name in names], names, ncols=5,
+                     loc="outside lower center")
 
 
-def plot_returns(table, tasks=MUJOCO_TASKS, title=""):
+def plot_returns(table, title=""):
     """Recorded returns, one panel per task: each seed thin, their mean thick.
 
     table: evaluations from `load_study`, any tasks and algorithms. Returns axes (1, 4).
     """
-    figure, axes = four_panels(title=title)
-    for ax, task in zip(axes[0], tasks):
+    axes = panels(None, title, 1, 4, figsize=(7.6, 2.6), sharex=True, squeeze=False)
+    for ax, task in zip(axes[0], MUJOCO_TASKS):
         draw_runs(ax, table[table.task == task], "mean")
     axes[0, 0].set_ylabel("return of an episode")
-    finish(figure, axes, tasks, table)
+    finish(axes, table)
     return axes
 
 
-def plot_lag(table, frozen_at=None, tasks=MUJOCO_TASKS, title=""):
+def plot_lag(table, frozen_at=None, title=""):
     """Bias above, and below it what is owed to lag, on the same scale.
 
-    table: rows of bias from `load_study`, one per run and evaluation; a panel for each
-    of `tasks`. frozen_at: the step after which the actors did not learn any more; drawn
-    grey.
+    table: rows of bias from `load_study`, one per run and evaluation. frozen_at: the
+    step after which the actors did not learn any more; drawn grey. Returns axes (2, 4).
     """
-    figure, axes = four_panels(2, 3.9, title)
-    for column, task in zip(axes.T, tasks):
+    axes = panels(None, title, 2, 4, figsize=(7.6, 3.9), sharex=True)
+    for column, task in zip(axes.T, MUJOCO_TASKS):
         runs = table[table.task == task]
         if len(runs) == 0:
             continue
@@ -374,19 +358,18 @@ def plot_lag(table, frozen_at=None, tasks=MUJOCO_TASKS, title=""):
                            zorder=0, label="actors frozen")
     axes[0, 0].set_ylabel(OVER_UNDER, fontsize=8.5)
     axes[1, 0].set_ylabel("owed to lag alone", fontsize=8.5)
-    finish(figure, axes, tasks, table)
+    finish(axes, table)
     return axes
 
 
-def plot_runs(scores, tasks=MUJOCO_TASKS, title=""):
+def plot_runs(scores, title=""):
     """Return against bias, one panel per task, one mark per run.
 
     scores: a DataFrame over (task, algorithm, seed) with "return" and "bias"; a filled
     mark is the mean of two or more runs of an algorithm.
     """
-    figure, axes = plt.subplots(1, 4, figsize=(7.6, 2.7), layout="constrained")
-    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    for ax, task in zip(axes, tasks):
+    axes = panels(None, title, 1, 4, figsize=(7.6, 2.7))
+    for ax, task in zip(axes, MUJOCO_TASKS):
         ax.set_title(task, loc="center", fontsize=9)
         ax.set_xlabel("Q − truth", fontsize=8.5)
         ax.tick_params(labelsize=8)
@@ -403,5 +386,5 @@ def plot_runs(scores, tasks=MUJOCO_TASKS, title=""):
                         markersize=8, color=colour)
         ax.margins(0.15)
     axes[0].set_ylabel("return of an episode")
-    one_legend(figure, axes)
+    one_legend(axes)
     return axes

@@ -14,6 +14,7 @@ from dnddpg_minimal.plots.style import (
     TWO,
     angle_ticks,
     draw_map,
+    panels,
     thousands,
 )
 
@@ -39,18 +40,13 @@ def plot_y(y, expected=None, ax=None, title=""):
     return ax
 
 
-plot_targets = plot_y  # its older name
-
-
 def plot_maximum(y, expected, counts, curves, samples, axes=None, title=""):
     """Eq. 5: how maxima scatter, and their mean against the number of actions.
 
     y (N,) and expected as in `plot_y`. counts (M,); curves: a dict from a label to the
     closed form (M,); samples: the same labels to simulated means (M,).
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, 2, figsize=(8, 2.9), layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, 2, figsize=(8, 2.9))
     plot_y(y, expected, axes[0])
     ax = axes[1]
     ax.axhline(0, **TRUTH)
@@ -63,21 +59,18 @@ def plot_maximum(y, expected, counts, curves, samples, axes=None, title=""):
     return axes
 
 
-def plot_growth(panels, axes=None, title=""):
+def plot_growth(cases, axes=None, title=""):
     """How a bias grows from sweep to sweep: a line for each case, its limit dotted.
 
-    panels: a dict from a panel's title to a dict from a label to (bias (N,), limit).
+    cases: a dict from a panel's title to a dict from a label to (bias (N,), limit).
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, len(panels), figsize=(7.4, 2.7),
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    for ax, (name, cases) in zip(axes, panels.items()):
-        for (label, (values, limit)), style in zip(cases.items(), (ONE, TWO, THREE)):
+    axes = panels(axes, title, 1, len(cases), figsize=(7.4, 2.7))
+    for ax, (name, curves) in zip(np.ravel(axes), cases.items()):
+        for (label, (values, limit)), style in zip(curves.items(), (ONE, TWO, THREE)):
             sweep = np.unique(np.geomspace(1, len(values), 50).astype(int))
             ax.plot(sweep, values[sweep - 1], label=label, **style)
             ax.axhline(limit, color="black", linestyle=":", linewidth=1.2)
-        positive = min(values.min() for values, _ in cases.values()) > 0
+        positive = min(values.min() for values, _ in curves.values()) > 0
         ax.set(xscale="log", yscale="log" if positive else "linear", xlabel="sweeps",
                ylabel="Q − truth")
         ax.set_title(name, loc="center", fontsize=9)
@@ -92,10 +85,7 @@ def plot_steps(curves, points, axes=None, title=""):
     points: the same titles to (start, climbs the critic, climbs the truth): actions.
     Dots lie on both curves, above the two actions that were reached.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, len(curves), figsize=(8, 2.9), sharey=True,
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, len(curves), figsize=(8, 2.9), sharey=True)
     for ax, (name, (action, critic, truth)) in zip(np.ravel(axes), curves.items()):
         ax.plot(action, truth, label="truth $Q^π$", **TRUTH | {"linewidth": 2})
         ax.plot(action, critic, label="critic $Q_θ$", linewidth=2,
@@ -124,28 +114,27 @@ def plot_error_and_share(pictures, limit, axes=None, title=""):
     seeds. Above: the mean over seeds; colours end at ±limit. Below: the share of seeds
     that overestimate.
     """
-    if axes is None:
-        figure, axes = plt.subplots(2, len(pictures), figsize=(7, 3.2), sharex=True,
-                                    sharey=True, layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 2, len(pictures), figsize=(7, 3.2), sharex=True,
+                  sharey=True)
+    grid = np.reshape(axes, (2, len(pictures)))
     for n, (step, picture) in enumerate(pictures.items()):
         error = picture["error"]
-        mean = draw_map(axes[0, n], picture, error.mean(axis=0), ERRORS, -limit, limit)
-        share = draw_map(axes[1, n], picture, 100 * (error > 0).mean(axis=0), "PuOr_r",
+        mean = draw_map(grid[0, n], picture, error.mean(axis=0), ERRORS, -limit, limit)
+        share = draw_map(grid[1, n], picture, 100 * (error > 0).mean(axis=0), "PuOr_r",
                      0, 100)
-        note_mean(axes[0, n], error)
-        axes[0, n].set_title(f"step {step:,}".replace(",", " "), loc="center",
+        note_mean(grid[0, n], error)
+        grid[0, n].set_title(f"step {step:,}".replace(",", " "), loc="center",
                              fontsize=9)
-        axes[0, n].set_xlabel("")
-        axes[1, n].set_xlabel("")
-        angle_ticks(axes[1, n], every=2)
-    axes[0, 0].figure.supxlabel("angle (0 is upright)", fontsize=9)
-    for row in axes:
-        row[0].set_ylabel("velocity")
-    figure = axes[0, 0].figure
-    bar = figure.colorbar(mean, ax=axes[0], extend="both")
+        grid[0, n].set_xlabel("")
+        grid[1, n].set_xlabel("")
+        angle_ticks(grid[1, n], every=2)
+    for ax in grid[:, 0]:
+        ax.set_ylabel("velocity")
+    figure = grid[0, 0].figure
+    figure.supxlabel("angle (0 is upright)", fontsize=9)
+    bar = figure.colorbar(mean, ax=grid[0], extend="both")
     bar.set_label("Q − truth\n← under   over →", fontsize=8)
-    bar = figure.colorbar(share, ax=axes[1])
+    bar = figure.colorbar(share, ax=grid[1])
     bar.set_label("seeds that\noverestimate (%)", fontsize=8)
     return axes
 
@@ -159,10 +148,7 @@ def plot_owed(table, owed, control, debt, axes=None, title=""):
     bias (S, N)) of S runs, a thin line each; debt: (updates (M,), bias (M,)), what is
     owed where the actor is frozen.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, 2, figsize=(7.2, 2.7), layout="constrained",
-                                    width_ratios=(3, 2))
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, 2, figsize=(7.2, 2.7), width_ratios=(3, 2))
     ax, right = axes
     for name, runs in table.groupby("algorithm", sort=False):
         seeds = runs.pivot(index="step", columns="seed", values="bias")
@@ -203,23 +189,21 @@ def plot_along_action(action, cases, added, axes=None, title=""):
     triangles mark where each is largest. Last panel, added: a dict from a label to
     (size (M,), share of costly choices (M,), %) when that error is added to a critic.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, len(cases) + 1, figsize=(7.6, 2.7),
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, len(cases) + 1, figsize=(7.6, 2.7))
     styles = dict(critic=STYLE["DDPG"] | {"linewidth": 2}, truth=TRUTH)
-    for ax, (name, pair) in zip(axes, cases.items()):
+    flat = np.ravel(axes)
+    for ax, (name, pair) in zip(flat, cases.items()):
         for (label, style), values in zip(styles.items(), pair):
             level, top = values - values.mean(), values.argmax()
             ax.plot(action, level, label=label, **style)
             ax.plot(action[top], level[top], "v", color=style["color"], markersize=9)
         ax.set(xlabel="action")
         ax.set_title(name, loc="center", fontsize=9)
-    axes[0].set_ylabel("value − mean over actions")
-    axes[0].legend()
+    flat[0].set_ylabel("value − mean over actions")
+    flat[0].legend()
     for (label, values), style in zip(added.items(), (TWO, ONE)):
-        axes[-1].plot(*values, marker="o", markersize=4, label=label, **style)
-    axes[-1].set(xlabel="size of the added error", ylim=0)
-    axes[-1].set_title("costly choices (% of states)", loc="center", fontsize=9)
-    axes[-1].legend(loc="lower right")
+        flat[-1].plot(*values, marker="o", markersize=4, label=label, **style)
+    flat[-1].set(xlabel="size of the added error", ylim=0)
+    flat[-1].set_title("costly choices (% of states)", loc="center", fontsize=9)
+    flat[-1].legend(loc="lower right")
     return axes

@@ -13,6 +13,7 @@ from dnddpg_minimal.plots.style import (
     WRONG,
     legend_below,
     pale,
+    panels,
     thousands,
 )
 
@@ -44,9 +45,7 @@ def plot_who_acts(constants, share, lost, axes=None, title=""):
     states in which actor 2 acts, and the true value that its choices lose. Thin lines
     are agents, thick ones their mean.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, 2, figsize=(7.2, 2.7), layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, 2, figsize=(7.2, 2.7))
     for ax, curves, label in zip(axes, (share, lost), (
             "share of states\nin which actor 2 acts", "true value lost by the choice")):
         for (rule, values), style in zip(curves.items(), (ONE, TWO, THREE)):
@@ -66,9 +65,7 @@ def plot_table_1(schedules, values, limit, axes=None, title=""):
     schedules: a dict from a label to (updates (M,), share of the way (M,)).
     values (N,): true values of states; limit: a lower limit of y.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, 2, figsize=(7.4, 2.7), layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, 2, figsize=(7.4, 2.7))
     styles = (ONE, TWO, THREE, dict(color="0.35", linestyle="-.", linewidth=1.4))
     for (label, curve), style in zip(schedules.items(), styles):
         axes[0].plot(*curve, label=label, **style)
@@ -110,7 +107,7 @@ def plot_ends(length, cut, whole, tasks, ax=None, title=""):
                     fontsize=8.5)
     ax.set(title=title, xscale="log", xlabel="steps of an episode", ylabel="Q",
            ylim=(0, 1.16 * whole))
-    ax.xaxis.set_major_formatter(lambda x, _: f"{x:,.0f}".replace(",", " "))
+    thousands(ax)
     legend_below(ax)
     return ax
 
@@ -145,11 +142,9 @@ def plot_consequences(found, expected=None, axes=None, title=""):
     The scale is linear up to ±10 and logarithmic beyond.
     """
     rows = list(next(iter(found.values())))
-    if axes is None:
-        figure, axes = plt.subplots(1, len(found), sharey=True, layout="constrained",
-                                    figsize=(7.4, 0.9 + 0.21 * len(rows)))
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    for ax, (quantity, readings) in zip(axes, found.items()):
+    axes = panels(axes, title, 1, len(found), sharey=True,
+                  figsize=(7.4, 0.9 + 0.21 * len(rows)))
+    for ax, (quantity, readings) in zip(np.ravel(axes), found.items()):
         ax.axvline(0, **TRUTH)
         for n, (values, interval) in enumerate(readings.values()):
             ax.plot(values, np.full(len(values), n), "|", markersize=7, color="0.45",
@@ -171,6 +166,7 @@ def plot_consequences(found, expected=None, axes=None, title=""):
         ax.minorticks_off()
         ax.tick_params(axis="x", labelsize=8)
         ax.set(xlim=(-1.6 * reach, 1.6 * reach), xlabel=f"difference in {quantity}")
-    axes[0].set_yticks(range(len(rows)), rows, fontsize=8)
-    axes[0].set_ylim(len(rows) - 0.5, -0.5)
+    first = np.ravel(axes)[0]
+    first.set_yticks(range(len(rows)), rows, fontsize=8)
+    first.set_ylim(len(rows) - 0.5, -0.5)
     return axes

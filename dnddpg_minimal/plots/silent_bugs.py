@@ -11,6 +11,7 @@ from dnddpg_minimal.plots.style import (
     TRUTH,
     TWO,
     pale,
+    panels,
     thousands,
 )
 
@@ -26,12 +27,10 @@ def plot_line_up(agents, axes=None, title=""):
     A letter with an empty dict gets panels that say so. Three letters in a row.
     """
     rows = 2 * -(-len(agents) // 3)
-    if axes is None:
-        figure, axes = plt.subplots(rows, 3, figsize=(7.6, 1.3 * rows + 0.8),
-                                    layout="constrained", squeeze=False)
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, rows, 3, figsize=(7.6, 1.3 * rows + 0.8), squeeze=False)
+    grid = np.reshape(axes, (rows, 3))
     for n, (letter, agent) in enumerate(agents.items()):
-        above, below = axes[2 * (n // 3):2 * (n // 3) + 2, n % 3]
+        above, below = grid[2 * (n // 3):2 * (n // 3) + 2, n % 3]
         above.set_title(letter, loc="left", fontweight="bold")
         for ax in (above, below):
             few_steps(ax)
@@ -54,15 +53,15 @@ def plot_line_up(agents, axes=None, title=""):
         if high - low < 50:  # hardly any change: do not enlarge it
             above.set_ylim(low - 25, high + 25)
     for row in range(rows):
-        axes[row, 0].set_ylabel("return" if row % 2 == 0 else "Q, truth")
-    for ax in axes[-1]:
+        grid[row, 0].set_ylabel("return" if row % 2 == 0 else "Q, truth")
+    for ax in grid[-1]:
         ax.set_xlabel("environment steps")
-    axes[0, 0].plot([], [], color=THREE["color"], label="this agent, tests")
-    axes[0, 0].plot([], [], color="0.8", linewidth=6, label="right agents, tests")
-    axes[1, 0].plot([], [], **STYLE["DDPG"], label="Q at starts")
-    axes[1, 0].plot([], [], label="truth there", **TRUTH)
-    handles = [h for ax in axes[:2, 0] for h in ax.get_legend_handles_labels()[0]]
-    axes[0, 0].figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    grid[0, 0].plot([], [], color=THREE["color"], label="this agent, tests")
+    grid[0, 0].plot([], [], color="0.8", linewidth=6, label="right agents, tests")
+    grid[1, 0].plot([], [], **STYLE["DDPG"], label="Q at starts")
+    grid[1, 0].plot([], [], label="truth there", **TRUTH)
+    handles = [h for ax in grid[:2, 0] for h in ax.get_legend_handles_labels()[0]]
+    grid[0, 0].figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return axes
 
 
@@ -81,10 +80,8 @@ def plot_practice(agents, axes=None, title=""):
     """
     columns = min(len(agents), 4)
     rows = -(-len(agents) // columns)
-    if axes is None:
-        figure, axes = plt.subplots(rows, columns, figsize=(7.8, 1.7 * rows + 0.5),
-                                    layout="constrained", squeeze=False)
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, rows, columns, figsize=(7.8, 1.7 * rows + 0.5),
+                  squeeze=False)
     every = np.ravel(axes)
     for ax in every[len(agents):]:
         ax.set_visible(False)
@@ -113,11 +110,8 @@ def plot_questions(groups, axes=None, title=""):
     its own.
     """
     widths = [len(agents) for agents in groups.values()]
-    if axes is None:
-        figure, axes = plt.subplots(1, len(groups), figsize=(7.4, 2.9),
-                                    width_ratios=widths, squeeze=False,
-                                    layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, len(groups), figsize=(7.4, 2.9), width_ratios=widths,
+                  squeeze=False)
     names = ("Q at starts", "Q at visited states", "Q there, for the action done")
     for ax, (panel, agents) in zip(np.ravel(axes), groups.items()):
         ax.axhline(0, color=GREY, linewidth=0.8)

@@ -12,11 +12,13 @@ STYLE = {  # of the lines of each algorithm
     "DCN-DDPG": dict(color="#0072B2", linestyle="--"),
     "DN-DDPG": dict(color="#009E73", linestyle="-."),
 }
+MARKS = {"DDPG": "o", "DCN-DDPG": "s", "DN-DDPG": "D"}  # of single runs
 TRUTH = dict(color="black", linestyle="-", linewidth=1.2)
 WRONG = dict(color="#CC79A7", linestyle=":", linewidth=2.4)  # a fault, on purpose
 VALUES, ERRORS = "cividis", "RdBu_r"  # maps of values, and of errors around 0
 SIGN = "overestimates ↑ / underestimates ↓"
 SIGN_TURNED = "← underestimates / overestimates →"  # beside an upright axis
+SIGN_BAR = "← underestimates    overestimates →"  # beside an upright colour bar
 GREY = "0.6"
 ONE = dict(color="#E69F00", linestyle="-", linewidth=2)  # lines of no algorithm
 TWO = dict(color="#56B4E9", linestyle="--", linewidth=2)
@@ -33,6 +35,15 @@ plt.rcParams.update({
     "legend.frameon": False,
     "legend.fontsize": 8.5,
 })
+
+
+def panels(axes, title, *shape, **how):
+    """`axes`, or if that is None those of a new figure; shape, how: as plt.subplots."""
+    if axes is not None:
+        return axes
+    figure, axes = plt.subplots(*shape, layout="constrained", **how)
+    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    return axes
 
 
 def style_of(label):
@@ -92,6 +103,14 @@ def draw_map(ax, picture, values, colours, low=None, high=None):
     if is_angle(x):
         angle_ticks(ax)
     return image
+
+
+def shades(error, limit, count):
+    """Errors (N, N), rounded for a map to `count` shades on each side of 0.
+
+    A shade is limit / count wide. None of them is white: the sign is always seen.
+    """
+    return (np.floor(error / limit * count) + 0.5) / count * limit
 
 
 def is_angle(x):

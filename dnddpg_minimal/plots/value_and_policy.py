@@ -11,6 +11,7 @@ from dnddpg_minimal.plots.style import (
     TRUTH,
     TWO,
     VALUES,
+    panels,
     zero_line,
 )
 
@@ -100,20 +101,20 @@ def plot_slices(action, truth, guesses, tops=False, ax=None, title=""):
     return ax
 
 
-def plot_decay(errors, share=0.01, ax=None, title=""):
+def plot_decay(errors, ax=None, title=""):
     """What is left of an error after n backups, as a share of its first size.
 
-    errors: a dict from a label to (N,), starting with 1. A thin line marks `share`.
+    errors: a dict from a label to (N,), starting with 1. A thin line marks 1 %.
     """
     if ax is None:
         _, ax = plt.subplots(figsize=(6.4, 3), layout="constrained")
     for (label, values), style in zip(errors.items(), (ONE, TWO, THREE)):
         ax.semilogy(values, label=label, **style)
-    ax.axhline(share, color=GREY, linewidth=1)
-    ax.annotate(f"{share:.0%} is left", (0.99, share), ha="right", va="bottom",
+    ax.axhline(0.01, color=GREY, linewidth=1)
+    ax.annotate("1% is left", (0.99, 0.01), ha="right", va="bottom",
                 xycoords=("axes fraction", "data"), color="0.4")
     ax.set(title=title, xlabel="backups", ylabel="share of the error",
-           ylim=(share / 5, 1.2))
+           ylim=(0.002, 1.2))
     ax.legend(loc="upper right", bbox_to_anchor=(1, 0.9))
     return ax
 
@@ -215,9 +216,7 @@ def plot_price(slopes, bias, lost, axes=None, title=""):
     slopes (M,). bias, lost: dicts from a label to values: (M,) are measured, drawn as
     marks; a pair of arrays (x, y) is a prediction, drawn as a black line.
     """
-    if axes is None:
-        figure, axes = plt.subplots(1, 2, figsize=(6.6, 2.8), layout="constrained")
-        figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    axes = panels(axes, title, 1, 2, figsize=(6.6, 2.8))
     marks = (("o", ONE), ("s", TWO), ("^", THREE))
     zero_line(axes[0])
     axes[1].axhline(0, color=GREY, linewidth=0.8)
