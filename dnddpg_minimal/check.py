@@ -1,4 +1,4 @@
-"""`python -m dnddpg_minimal check exercises/NN_name.ipynb`: points, and what is wrong.
+"""`python -m dnddpg_minimal check my/NN_name.ipynb`: points, and what is wrong.
 
 Several notebooks may be named, and `--csv FILE` collects their points in a table. Each
 notebook runs from top to bottom in a fresh kernel. Whoever changed a check does
@@ -144,7 +144,8 @@ def source_of(nb, path):
     if chapter is None and path.name[:2].isdecimal():
         chapter = int(path.name[:2])
     for solution in (ROOT / "solutions").glob(f"{chapter or 0:02d}_*.ipynb"):
-        stripped = path.parent.name == "exercises" and path.name == solution.name
+        chapter_itself = path.resolve().parent.name == "notebooks"  # of the same name
+        stripped = path.name == solution.name and not chapter_itself
         if numbers or stripped:  # by a program that keeps no metadata
             return read(solution), (f"checks of solutions/{solution.name}, "
                                     "hidden tests included")
@@ -302,7 +303,11 @@ def in_words(name, text):
     text = " ".join(text.split())
     if name == "NotImplementedError":
         return "not done yet: a raise NotImplementedError is left"
-    return f"{name}: {text}" if name not in ("", "AssertionError") else text
+    if name not in ("", "AssertionError"):
+        text = f"{name}: {text}"
+    if "NoneType" in text:
+        text = f"{text.rstrip('.')}. Does your function end in `return`?"
+    return text
 
 
 if __name__ == "__main__":

@@ -51,13 +51,13 @@ def claim(ok, sentence):
         raise AssertionError(sentence)
 
 
-def close(value, expected, name, atol=1e-6, rtol=0.0, mistakes=None):
+def close(value, expected, name, atol=1e-6, rtol=1e-6, mistakes=None):
     """AssertionError, in words and numbers, unless `value` is what was expected.
 
     value: what the student's code returned, which comes back as an array, also where it
     is a list; expected: an array or a number. `name` stands at the beginning of the
     sentence. Shapes must be equal, nothing is broadcast; a number may be off by atol
-    + rtol · |expected|.
+    + rtol · |expected|, so float32 is good enough.
     mistakes: {sentence: what one gets by this mistake}; the sentence is added where
     the value is that of the mistake.
     """
@@ -75,24 +75,28 @@ def close(value, expected, name, atol=1e-6, rtol=0.0, mistakes=None):
 
     if same(expected):
         return value
+    said = _difference(value, expected, name, rtol)
     for sentence, wrong in (mistakes or {}).items():
         if same(np.asarray(wrong, float)):
-            raise AssertionError(f"{_difference(value, expected, name)} {sentence}")
-    raise AssertionError(_difference(value, expected, name))
+            raise AssertionError(f"{said} {sentence}")
+    raise AssertionError(said)
 
 
-def _difference(value, expected, name):
-    """One sentence: the shapes, or the worst of the numbers."""
+def _difference(value, expected, name, rtol):
+    """One sentence: the shapes, or the worst of the numbers, in digits that differ."""
     if value.shape != expected.shape:
         return f"{name} has shape {value.shape}: expected {expected.shape}."
     if not np.isfinite(value).all():
         return f"{name} holds {value[~np.isfinite(value)][0]}: expected finite numbers."
-    if value.ndim == 0:
-        return f"{name} is {value:.6g}: expected {expected:.6g}."
-    worst = np.unravel_index(np.abs(value - expected).argmax(), value.shape)
-    place = ", ".join(map(str, worst))
-    return (f"{name} has {value[worst]:.6g} at [{place}]: expected "
-            f"{expected[worst]:.6g}.")
+    gap = np.abs(value - expected)
+    gap = np.where(gap > rtol * np.abs(expected), gap, 0)  # what is near is not worst
+    worst = np.unravel_index(gap.argmax(), value.shape)
+    found, wanted = value[worst], expected[worst]
+    digits = next((digits for digits in range(6, 17)
+                   if f"{found:.{digits}g}" != f"{wanted:.{digits}g}"), 17)
+    place = f" at [{', '.join(map(str, worst))}]" if worst else ""
+    return (f"{name} {'has' if place else 'is'} {found:.{digits}g}{place}: expected "
+            f"{wanted:.{digits}g}.")
 
 
 # --- Exercises from solutions ---------------------------------------------------------

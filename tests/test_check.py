@@ -170,17 +170,33 @@ def test_a_notebook_is_known_by_its_checks_not_by_its_name(tmp_path):
     assert "solutions/01_value.ipynb" in check.source_of(nb, path)[1]
 
 
-def test_a_notebook_that_lost_its_metadata_gets_the_checks_at_its_end(tmp_path):
+@pytest.mark.parametrize("folder", ["exercises", "my", "anna"])
+def test_a_notebook_that_lost_its_metadata_gets_the_checks_at_its_end(tmp_path, folder):
     nb = content(EXERCISE)
     for cell in nb["cells"]:
         cell["metadata"] = {}
-    path = tmp_path / "exercises" / "01_value.ipynb"
+    path = tmp_path / folder / "01_value.ipynb"
     path.parent.mkdir()
     path.write_text(json.dumps(nb), encoding="utf-8")
     cells, _ = prepared(path)
     original = [cell for cell in check.read(SOLUTION).cells if check.is_locked(cell)]
     assert [cell.source for cell in cells[-len(original):]] == [
         cell.source for cell in original]
+
+
+def test_a_chapter_of_the_same_name_is_no_exercise(monkeypatch):
+    monkeypatch.chdir(ROOT / "notebooks")  # the folder's name is not in the path
+    with pytest.raises(ValueError, match="holds no exercise with a check"):
+        prepared(Path("01_value.ipynb"))
+
+
+def test_a_forgotten_return_is_named():
+    ask = "Does your function end in `return`?"
+    assert check.in_words("TypeError", "object of type 'NoneType' has no len()") == (
+        f"TypeError: object of type 'NoneType' has no len(). {ask}")
+    assert check.in_words("AssertionError", "f gave a NoneType: expected two.") == (
+        f"f gave a NoneType: expected two. {ask}")
+    assert check.in_words("TypeError", "can't multiply") == "TypeError: can't multiply"
 
 
 @pytest.mark.parametrize("text, words", [

@@ -357,11 +357,17 @@ def test_close_accepts_what_is_close_and_of_the_same_shape():
     classroom.close([1, 2 + 1e-9], np.array([1.0, 2.0]), "y")
     classroom.close(3, 3.0, "y")
     classroom.close(101.0, 100.0, "y", rtol=0.02)
+    classroom.close(np.float32(49.9625), 49.9625, "y")
 
 
 def test_close_says_place_number_and_expected_number():
     assert says([[1, 2], [3, 9]], [[1, 2], [3, 4]]) == "y has 9 at [1, 1]: expected 4."
     assert says(0.5, 2.0) == "y is 0.5: expected 2."
+
+
+def test_close_names_the_number_that_is_wrong_in_digits_that_differ():
+    assert says(1.000004, 1.0) == "y is 1.000004: expected 1."
+    assert says([1e6 + 0.5, 1.1], [1e6, 1]) == "y has 1.1 at [1]: expected 1."
 
 
 def test_close_never_broadcasts():
